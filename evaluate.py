@@ -1,0 +1,94 @@
+"""Compare strategies on the same humans and rebuild the paper's figures.
+
+`python evaluate.py --help` lists the keys.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import hydra
+from omegaconf import DictConfig
+
+import app
+from torchrl_pref import comparison, experiment, reports
+from torchrl_pref.checkpoint import FILE_NAME, Checkpoint
+from torchrl_pref.errors import InputError, one_line_errors
+from torchrl_pref.queries import QueryPool
+
+
+@hydra.main(config_path="conf", config_name="evaluate", version_base="1.3")
+def job(config: DictConfig) -> None:
+    """Evaluate checkpoints, or the baselines where none is named."""
+    folder = app.output_folder()
+    try:
+        with one_line_errors():
+            settings = app.plain_settings(config)
+            named = settings["checkpoint"]
+            if named is None:
+                reports.write_report(folder, evaluate_baselines(settings), {})
+            else:
+                allowed = ("evaluation.", "pool.test", "device", "threads", "hydra.")
+                app.refuse_other_overrides("checkpoint", allowed)
+                paths = find_checkpoints(named if isinstance(named, list) else [named])
+                reports.write_report(folder, *evaluate_checkpoints(settings, paths))
+    finally:
+        app.discard_if_empty(folder)
+
+
+def evaluate_baselines(settings: dict[str, Any]) -> comparison.Panels:
+    """Random and greedy, a panel for each tau."""
+    taus = settings["tau"] if isinstance(settings["tau"], list) else [settings["tau"]]
+    pools = experiment.make_pools(settings)
+    panels: comparison.Panels = {}
+    for task in [experiment.make_task(*pools, tau) for tau in taus]:
+        panels |= comparison.evaluate_panels(settings, task, {})
+    return panels
+
+
+def find_checkpoints(named: list[str]) -> list[Path]:
+    """The checkpoint files meant by files, run folders and sweep folders.
+
+    Raises:
+        InputError: a path holds none.
+    """
+    paths = []
+    for name in map(Path, named):
+        found = [name] if name.is_file() else sorted(name.rglob(FILE_NAME))
+        if not found:
+            raise InputError(
+                f"checkpoint={name}: no {FILE_NAME} there; expected a checkpoint file, the folder "
+                "of a run or of a sweep; check the path"
+            )
+        paths += found
+    return paths
+
+
+def evaluate_checkpoints(
+    settings: dict[str, Any], paths: list[Path]
+) -> tuple[comparison.Panels, dict[str, dict[str, list[float]]]]:
+    """Learned policies beside random and greedy, a panel for each kind of human."""
+    runs = []
+    for path in paths:
+        checkpoint = Checkpoint.load(path)
+        # The rest of the settings is the checkpoint's own.
+        for section in ("evaluation", "device"):
+            checkpoint.settings[section] = settings[section]
+        pools = path.with_name("train_pool.pt"), path.with_name("test_pool.pt")
+        runs.append((path.parent.name, checkpoint, experiment.reload_task(checkpoint, *pools)))
+    panels: comparison.Panels = {}
+    for panel_settings, task, learned in comparison.group_checkpoints(runs):
+        test = None
+        if settings["pool"]["test"] is not None:
+            test = QueryPool.load(settings["pool"]["test"]).map_features(task.normalizer)
+        panels |= comparison.evaluate_panels(panel_settings, task, learned, test)
+    histories = {
+        f"{comparison.label_of(checkpoint.settings)}, {task.title}, {name}": checkpoint.history
+        for name, checkpoint, task in runs
+    }
+    return panels, histories
+
+
+if __name__ == "__main__":
+    app.main(job)

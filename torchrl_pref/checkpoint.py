@@ -1,0 +1,97 @@
+"""Checkpoints: weights, the whole configuration, the normaliser and the digests of the pools."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from torchrl_pref.errors import InputError
+from torchrl_pref.features import Normalizer
+from torchrl_pref.queries import QueryPool, load_safely, save_atomically
+
+KIND = "torchrl_pref checkpoint"
+FILE_NAME = "checkpoint.pt"
+
+
+@dataclass
+class Checkpoint:
+    """All that is needed to evaluate a policy elsewhere, or to go on training it.
+
+    Attributes:
+        settings: the run's whole configuration, plain data.
+        tau: the human's tau as solved or given; None for an optimal human.
+        mean, std: (D), the normaliser of the training pool.
+        train_digest, test_digest: of the run's normalised pools.
+        pool_shape: N, K and D of the training pool.
+        weights: state dict of the policy.
+        training: what the training loop needs to go on, bit for bit.
+    """
+
+    settings: dict[str, Any]
+    tau: float | None
+    mean: Tensor
+    std: Tensor
+    train_digest: str
+    test_digest: str
+    pool_shape: dict[str, int]
+    weights: dict[str, Any]
+    training: dict[str, Any]
+
+    @property
+    def normalizer(self) -> Normalizer:
+        """The normaliser fitted on the training pool."""
+        return Normalizer(self.mean, self.std)
+
+    @property
+    def history(self) -> dict[str, list[float]]:
+        """What was logged at each update, by metric name; NaN where no episode ended."""
+        return self.training["history"]
+
+    @property
+    def picks_by_index(self) -> bool:
+        """Whether the policy picks an index of its training pool, as the paper's query policy."""
+        return self.settings["policy"]["name"] == "paper" and (
+            self.settings["setup"]["name"] == "query"
+        )
+
+    def save(self, path: str | Path) -> None:
+        """Write the checkpoint, whole or not at all."""
+        save_atomically({"kind": KIND, **asdict(self)}, path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Checkpoint:
+        """Read a checkpoint from a file or from the folder of a run, with ``weights_only=True``.
+
+        Raises:
+            InputError: it is missing, cut off, or written by something else.
+        """
+        path = Path(path)
+        content = load_safely(path / FILE_NAME if path.is_dir() else path, KIND)
+        content.pop("kind")
+        if set(content) != set(cls.__dataclass_fields__):
+            differs = sorted(set(content) ^ set(cls.__dataclass_fields__))
+            raise InputError(
+                f"{path}: written by another version of this package (differs in "
+                f"{', '.join(differs)}); train again, or use the version that wrote it"
+            )
+        return cls(**content)
+
+    def check_fits(self, pool: QueryPool) -> None:
+        """Refuse a pool on which this policy has no meaning.
+
+        Raises:
+            InputError: options, features or (for the paper's policy) queries differ.
+        """
+        expected = dict(self.pool_shape)
+        found = {"N": len(pool), "K": pool.n_options, "D": pool.n_features}
+        if not self.picks_by_index:
+            expected.pop("N")
+        differs = [f"{k}={found[k]} (trained on {v})" for k, v in expected.items() if found[k] != v]
+        if differs:
+            raise InputError(
+                f"the checkpoint does not fit the pool: {', '.join(differs)}; evaluate it on a "
+                "pool of the shape it was trained on, or train a policy for this pool"
+            )

@@ -1,0 +1,156 @@
+"""Learned policies beside random and greedy: the rows of the tables, the panels of Figure 1."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+from tqdm import tqdm
+
+from torchrl_pref.checkpoint import Checkpoint
+from torchrl_pref.envs import FeedEnv, QueryEnv
+from torchrl_pref.errors import InputError, check_count
+from torchrl_pref.evaluation import Evaluation, draw_humans, evaluate
+from torchrl_pref.experiment import (
+    Settings,
+    Task,
+    load_weights,
+    make_feed_env,
+    make_policy,
+    make_query_env,
+)
+from torchrl_pref.policies import Policy
+from torchrl_pref.queries import QueryPool
+from torchrl_pref.strategies import Greedy, RandomAsk, RandomQuery
+
+Panels = dict[str, dict[str, Evaluation]]
+
+
+def label_of(settings: Settings) -> str:
+    """The name of a learned policy in tables and figures: the paper's ``RL`` and ``RL-feed``."""
+    return "RL-feed" if settings["setup"]["name"] == "feed" else "RL"
+
+
+def evaluate_panels(
+    settings: Settings, task: Task, learned: Mapping[str, Checkpoint], test: QueryPool | None = None
+) -> Panels:
+    """Compare strategies on the held-out pool.
+
+    The paper's query policy picks an index of its training pool, which means nothing on another
+    pool. It is evaluated on the held-out pool all the same, and on its own pool in a second panel.
+
+    Args:
+        settings: the sections ``setup``, ``belief``, ``evaluation`` and ``device``.
+        task: the pools and the response model.
+        learned: checkpoints to evaluate, by the name to show.
+        test: another held-out pool, normalised; by default the task's.
+
+    Returns:
+        By title: by name of the strategy, what it did.
+    """
+    held_out = task.test if test is None else test
+    if not any(checkpoint.picks_by_index for checkpoint in learned.values()):
+        return {task.title: compare(settings, task, held_out, learned)}
+    return {
+        f"{task.title}, held-out pool": compare(settings, task, held_out, learned),
+        f"{task.title}, training pool": compare(settings, task, task.train, learned),
+    }
+
+
+def compare(
+    settings: Settings, task: Task, pool: QueryPool, learned: Mapping[str, Checkpoint]
+) -> dict[str, Evaluation]:
+    """Random, greedy information gain and learned policies on the same humans and luck.
+
+    Random and greedy choose from the whole pool, as in the paper's Figure 1, whatever the setup.
+
+    Args:
+        settings: the sections ``setup``, ``belief``, ``evaluation`` and ``device``.
+        task: gives the response model.
+        pool: the queries, normalised.
+        learned: checkpoints to evaluate, by the name to show.
+
+    Returns:
+        By name: ``random``, ``greedy``, for a feed also ``ask all``, and the learned ones.
+    """
+    n_humans = check_count("evaluation.humans", settings["evaluation"]["humans"], 2)
+    seed = check_count("evaluation.seed", settings["evaluation"]["seed"], 0)
+    humans = draw_humans(make_query_env(settings, task, pool, n_humans, seed))
+    runs: list[tuple[str, QueryEnv | FeedEnv, TensorDictModuleBase, bool]] = []
+
+    query_env = make_query_env(settings, task, pool, n_humans, seed)
+    runs.append(("random", query_env, RandomQuery(seed), False))
+    runs.append(("greedy", query_env, Greedy(task.response_model), False))
+    if settings["setup"]["name"] == "feed":
+        runs.append(
+            ("ask all", make_feed_env(settings, task, pool, n_humans, seed), RandomAsk(), False)
+        )
+    for name, checkpoint in learned.items():
+        env, policy = _load_policy(checkpoint, task, pool, n_humans, seed)
+        runs.append((name, env, policy.strategy, checkpoint.settings["policy"]["sample"]))
+
+    results = {}
+    for name, env, strategy, sample in tqdm(runs, desc="evaluation", unit="strategy"):
+        env.set_seed(seed)
+        torch.manual_seed(seed)
+        results[name] = evaluate(env, strategy, humans, sample)
+    return results
+
+
+def _load_policy(
+    checkpoint: Checkpoint, task: Task, pool: QueryPool, n_humans: int, seed: int
+) -> tuple[QueryEnv | FeedEnv, Policy]:
+    """A trained policy and the environment of its own setup on a pool."""
+    checkpoint.check_fits(pool)
+    settings = checkpoint.settings
+    make = make_feed_env if settings["setup"]["name"] == "feed" else make_query_env
+    env = make(settings, task, pool, n_humans, seed)
+    policy = make_policy(settings, env)
+    load_weights(policy, checkpoint)
+    return env, policy
+
+
+def group_checkpoints(
+    runs: Sequence[tuple[str, Checkpoint, Task]],
+) -> list[tuple[Settings, Task, dict[str, Checkpoint]]]:
+    """Put runs that faced the same kind of human on the same pools into one panel.
+
+    Args:
+        runs: name, checkpoint and task of each run.
+
+    Returns:
+        For each panel its settings, its task and its checkpoints by the name to show.
+
+    Raises:
+        InputError: runs of one panel were trained with other pools, budgets or beliefs, so that
+            they cannot be compared on the same humans.
+    """
+    groups: dict[str, list[tuple[str, Checkpoint, Task]]] = {}
+    for run in runs:
+        groups.setdefault(run[2].title, []).append(run)
+    panels = []
+    for members in groups.values():
+        _, first, task = members[0]
+        learned = {}
+        for name, checkpoint, _ in members:
+            for what, mine, theirs in (
+                ("the test pool", checkpoint.test_digest, first.test_digest),
+                ("the training pool", checkpoint.train_digest, first.train_digest),
+                ("budget", *(c.settings["setup"]["budget"] for c in (checkpoint, first))),
+                ("belief", *(c.settings["belief"] for c in (checkpoint, first))),
+            ):
+                if mine != theirs:
+                    raise InputError(
+                        f"{name} and {members[0][0]} differ in {what}: {mine} and {theirs}; "
+                        "evaluate them one at a time"
+                    )
+            label = label_of(checkpoint.settings)
+            same = sum(label_of(other.settings) == label for _, other, _ in members)
+            learned[label if same == 1 else f"{label} ({name})"] = checkpoint
+        # A feed's settings have all that a query environment needs, and not the other way round.
+        settings = max(
+            (c.settings for c in learned.values()), key=lambda s: s["setup"]["name"] == "feed"
+        )
+        panels.append((settings, task, learned))
+    return panels

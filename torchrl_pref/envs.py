@@ -1,0 +1,357 @@
+"""The two questions as TorchRL environments: which query to ask, and whether to ask this one.
+
+Shapes: B sessions, M belief samples, N queries in the pool, C candidates of a session, K options
+per query, D features, H query budget, O offers.
+
+A session is one human, from the prior to H answers. A step on a finished session changes nothing
+and is worth nothing, so that ``rollout(break_when_all_done=True)`` can wait for the others. All of
+a session's state is in the tensordict, under these keys, so partial resets, collectors and replay
+work and one environment serves any batch:
+
+====================================  ===========================================================
+``samples`` (B M D)                   belief samples of ω
+``mean`` (B D)                        their mean, the paper's state
+``remaining`` (B 1) or (B 2)          share of the asks (and of the offers) that is left
+``queries`` (B C K D)                 ``QueryEnv``: features of the candidates
+``action_mask`` (B C)                 ``QueryEnv``: candidates that may be asked
+``offer`` (B K D)                     ``FeedEnv``: features of the offered query
+``n_asked``, ``n_offered`` (B 1)      counts so far (``n_offered`` only in ``FeedEnv``)
+``human`` (omega, noise)              hidden: a strategy must not read it
+``history`` (queries, answers)        (B H) pool indices and chosen options, -1 where open
+``offers`` (B O), ``candidates`` …    pool indices of the stream or of the candidates
+``metrics``                           alignment, alignment_of_mean, information, ess (B 1)
+====================================  ===========================================================
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Generator, Tensor
+from torch.nn import functional as F
+from torchrl.data import Binary, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from torchrl_pref.acquisition import information_gain
+from torchrl_pref.belief import Belief, feature_gaps
+from torchrl_pref.errors import InputError, check_choice, check_count
+from torchrl_pref.humans import SimulatedHuman
+from torchrl_pref.queries import QueryPool
+
+
+class SessionEnv(EnvBase):
+    """What both environments share: a human, a belief, and what an answer does to it."""
+
+    _supports_set_state = True
+    _state_keys: tuple[str, ...]
+
+    def __init__(
+        self,
+        pool: QueryPool,
+        human: SimulatedHuman,
+        belief: Belief,
+        budget: int,
+        batch_size: tuple[int, ...],
+        seed: int,
+        device: torch.device | str,
+    ) -> None:
+        if len(batch_size) != 1:
+            raise InputError(f"batch_size={tuple(batch_size)}: expected one size, such as (64,)")
+        super().__init__(device=device, batch_size=torch.Size(batch_size))
+        self.register_buffer("features", pool.features.to(device))
+        self.human = human
+        self.belief = belief
+        self.budget = check_count("setup.budget", budget, 1)
+        self._set_seed(seed)
+
+    def _make_specs(self, n_actions: int) -> None:
+        """Read the specs off a state, so that no shape is written down twice."""
+        rng_state = self._generator.get_state()
+        state = self._observe(self._fresh_state())
+        self._generator.set_state(rng_state)
+        self.observation_spec = _spec_of(state)
+        self.state_spec = _spec_of(state.select(*self._state_keys))
+        batch, device = self.batch_size, self.device
+        self.action_spec = Categorical(n_actions, shape=batch, device=device)
+        self.reward_spec = Unbounded(shape=(*batch, 1), device=device)
+        flag = Binary(n=1, shape=(*batch, 1), dtype=torch.bool, device=device)
+        self.done_spec = Composite(
+            done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=batch
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        self._generator = Generator(self.device).manual_seed(0 if seed is None else seed)
+
+    @property
+    def generator(self) -> Generator:
+        """The environment's own source of randomness, on its device."""
+        if self._generator.device != self.device:
+            self._set_seed(self._generator.initial_seed())
+        return self._generator
+
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, set_state: bool = False, **kwargs: Any
+    ) -> TensorDictBase:
+        state = self._fresh_state()
+        if set_state and tensordict is not None:
+            given = tensordict.select(*state.keys(True, True), strict=False)
+            state.update(given.to(self.device).clone())
+        return self._observe(state)
+
+    def _fresh_state(self) -> TensorDict:
+        """New humans who have answered nothing. The draws that strategies share come first."""
+        size, n_features = self.batch_size.numel(), self.features.shape[-1]
+        rng, device = self.generator, self.device
+        n_options = self.features.shape[1]
+        human = self.human.draw(size, self.budget, n_options, n_features, rng)
+        open_slots = torch.full((size, self.budget), -1, device=device)
+        zero = torch.zeros((size, 1), device=device)
+        return TensorDict(
+            {
+                "human": human,
+                "samples": self.belief.prior(size, n_features, rng),
+                "history": {"queries": open_slots, "answers": open_slots.clone()},
+                "n_asked": zero.long(),
+                "metrics": {"information": zero, "ess": zero + self.belief.n_samples},
+            },
+            self.batch_size,
+            device=device,
+        )
+
+    def _observe(self, state: TensorDict) -> TensorDict:
+        """Add to a state what follows from it. Subclasses add what is on the table."""
+        samples, omega = state["samples"], state["human", "omega"]
+        mean = samples.mean(1)
+        cosines = F.cosine_similarity(samples, omega.unsqueeze(1), dim=-1)
+        state["mean"] = mean
+        state["remaining"] = 1 - state["n_asked"] / self.budget
+        state["metrics", "alignment"] = cosines.mean(1, keepdim=True)
+        state["metrics", "alignment_of_mean"] = F.cosine_similarity(mean, omega)[:, None]
+        return state
+
+    def _information(self, tensordict: TensorDictBase, index: Tensor) -> Tensor:
+        """(B 1), information gain in bits of pool query ``index`` (B) under the belief."""
+        options = self.features[index]
+        returns = tensordict["samples"] @ options.mT
+        log_probs = self.belief.response_model(returns)
+        return information_gain(log_probs).unsqueeze(-1)
+
+    def _ask(
+        self, tensordict: TensorDictBase, index: Tensor, information: Tensor, asked: Tensor
+    ) -> TensorDict:
+        """The state after the sessions marked in ``asked`` (B) asked pool query ``index`` (B)."""
+        keys = [key for key in self._state_keys if key not in ("queries", "offer")]
+        state = tensordict.select(*keys).clone()
+        who = asked.nonzero().squeeze(-1)
+        turn = state["n_asked"][who, 0]
+        answers = self.human.respond(self.features[index[who]], state["human"][who], turn)
+
+        history = state["history"]
+        earlier = feature_gaps(self.features[history["queries"][who]], history["answers"][who])
+        newest = feature_gaps(self.features[index[who]], answers)
+        # On the CPU only as many turns as were taken are worth the work; -1 slots come last.
+        earlier = earlier[:, : int(turn.max()) if len(who) else 0]
+        update = self.belief.update(
+            state["samples"][who], state["metrics", "ess"][who, 0], earlier, newest, self.generator
+        )
+        state["samples"][who] = update.samples
+        state["metrics", "ess"][who] = update.ess.unsqueeze(-1)
+        state["metrics", "information"][who] += information[who]
+        history["queries"][who, turn] = index[who]
+        history["answers"][who, turn] = torch.where(update.used, answers, -1)
+        state["n_asked"][who] += 1
+        return state
+
+    def _finish(
+        self, state: TensorDict, reward: Tensor, truncated: Tensor | None = None
+    ) -> TensorDict:
+        """Add observation, reward and done flags to the next state."""
+        terminated = state["n_asked"] >= self.budget
+        if truncated is None:
+            truncated = torch.zeros_like(terminated)
+        flags = {
+            "reward": reward,
+            "terminated": terminated,
+            "truncated": truncated & ~terminated,
+            "done": terminated | truncated,
+        }
+        return self._observe(state).update(flags)
+
+    @abstractmethod
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase: ...
+
+
+class QueryEnv(SessionEnv):
+    r"""The paper's first formulation: the action is which query to ask (section 3.3).
+
+    State: the belief. Action: the index of a candidate. Reward: the information gain in bits of the
+    asked query, :math:`r = H(\omega \mid Q) - E_{q_i} H(\omega \mid q_i, Q)`. The episode ends
+    after H answers.
+
+    Args:
+        pool: the queries, normalised.
+        human: who answers.
+        belief: how answers become a belief.
+        budget: H, queries in an episode, at least 1.
+        candidates: C, how many queries of the pool are on the table, at most N. Fewer than N makes
+            a fresh random subset for each session, so that a policy learns to choose and not to
+            remember. None puts the whole pool on the table, in order.
+        repeats: whether a query may be asked again.
+        batch_size: (B,), sessions that run side by side.
+        seed: seeds the environment's own generator; the global generators are never used.
+        device: where the tensors live.
+
+    Raises:
+        InputError: a number is below its minimum, or without repeats the candidates are too few.
+    """
+
+    _state_keys = ("human", "samples", "history", "n_asked", "metrics", "candidates")
+
+    def __init__(
+        self,
+        pool: QueryPool,
+        human: SimulatedHuman,
+        belief: Belief,
+        budget: int = 20,
+        candidates: int | None = None,
+        repeats: bool = True,
+        batch_size: tuple[int, ...] = (64,),
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        super().__init__(pool, human, belief, budget, batch_size, seed, device)
+        self.n_candidates = len(pool)
+        if candidates is not None:
+            self.n_candidates = min(check_count("setup.candidates", candidates, 1), len(pool))
+        if not repeats and self.n_candidates < budget:
+            raise InputError(
+                f"setup.repeats=false with {self.n_candidates} candidates and setup.budget={budget}"
+                ": expected at least as many candidates as asks; raise one or lower the other"
+            )
+        self.repeats = repeats
+        self._make_specs(self.n_candidates)
+
+    def _fresh_state(self) -> TensorDict:
+        state = super()._fresh_state()
+        size, n_queries = self.batch_size.numel(), len(self.features)
+        if self.n_candidates == n_queries:
+            chosen = torch.arange(n_queries, device=self.device).expand(size, -1)
+        else:
+            keys = torch.rand((size, n_queries), generator=self.generator, device=self.device)
+            chosen = keys.topk(self.n_candidates, dim=-1).indices
+        return state.set("candidates", chosen)
+
+    def _observe(self, state: TensorDict) -> TensorDict:
+        super()._observe(state)
+        candidates = state["candidates"]
+        if self.n_candidates == len(self.features):
+            # A view: the whole pool is the same for every session.
+            state["queries"] = self.features.expand(len(candidates), *self.features.shape)
+        else:
+            state["queries"] = self.features[candidates]
+        mask = torch.ones_like(candidates, dtype=torch.bool)
+        if not self.repeats:
+            asked = state["history", "queries"]
+            mask = ~(candidates.unsqueeze(-1) == asked.unsqueeze(-2)).any(-1)
+            # A finished session offers everything again, so that a policy still has a distribution.
+            mask = mask | ~mask.any(-1, keepdim=True)
+        state["action_mask"] = mask
+        return state
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = tensordict["action"].unsqueeze(-1)
+        index = tensordict["candidates"].gather(-1, action).squeeze(-1)
+        gain = self._information(tensordict, index)
+        asked = tensordict["n_asked"].squeeze(-1) < self.budget
+        return self._finish(self._ask(tensordict, index, gain, asked), gain * asked.unsqueeze(-1))
+
+
+class FeedEnv(SessionEnv):
+    r"""The paper's second formulation: queries stream by, ask or skip (section 3.4).
+
+    State: the belief and the offered query. Action: 1 asks, 0 skips. Reward: the information gain
+    r in bits of the offered query when it is asked, -r (the regret) when it is skipped. The episode
+    ends at H asked queries and is truncated at O offered ones.
+
+    Args:
+        pool: the queries, normalised. Offers are drawn from it independently and uniformly.
+        human: who answers.
+        belief: how answers become a belief.
+        budget: H, queries asked in an episode, at least 1.
+        offers: O, at least H. None is the paper's 2H.
+        on_skip: ``new`` offers another query after a skip; ``repeat`` is the paper's literal
+            s' = s and offers the same one again.
+        batch_size: (B,), sessions that run side by side.
+        seed: seeds the environment's own generator; the global generators are never used.
+        device: where the tensors live.
+
+    Raises:
+        InputError: a number is below its minimum, or ``on_skip`` is another word.
+    """
+
+    _state_keys = ("human", "samples", "history", "n_asked", "metrics", "offers", "n_offered")
+
+    def __init__(
+        self,
+        pool: QueryPool,
+        human: SimulatedHuman,
+        belief: Belief,
+        budget: int = 20,
+        offers: int | None = None,
+        on_skip: str = "new",
+        batch_size: tuple[int, ...] = (64,),
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        super().__init__(pool, human, belief, budget, batch_size, seed, device)
+        self.n_offers = 2 * budget
+        if offers is not None:
+            self.n_offers = check_count("setup.offers", offers, budget)
+        self.on_skip = check_choice("setup.on_skip", on_skip, ("new", "repeat"))
+        self._make_specs(2)
+
+    def _fresh_state(self) -> TensorDict:
+        state = super()._fresh_state()
+        shape = (self.batch_size.numel(), self.n_offers)
+        offers = torch.randint(
+            len(self.features), shape, generator=self.generator, device=self.device
+        )
+        state["offers"] = offers
+        state["n_offered"] = torch.zeros_like(state["n_asked"])
+        return state
+
+    def _offered(self, state: TensorDictBase) -> Tensor:
+        """(B), pool index of the query on offer; after the last offer, the last one."""
+        place = state["n_offered" if self.on_skip == "new" else "n_asked"]
+        return state["offers"].gather(-1, place.clamp(max=self.n_offers - 1)).squeeze(-1)
+
+    def _observe(self, state: TensorDict) -> TensorDict:
+        super()._observe(state)
+        offers_left = 1 - state["n_offered"] / self.n_offers
+        state["remaining"] = torch.cat([state["remaining"], offers_left], -1)
+        state["offer"] = self.features[self._offered(state)]
+        return state
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        index = self._offered(tensordict)
+        going_on = (tensordict["n_asked"] < self.budget) & (tensordict["n_offered"] < self.n_offers)
+        asks = (tensordict["action"] == 1).unsqueeze(-1)
+        gain = self._information(tensordict, index) * going_on
+        state = self._ask(tensordict, index, gain, (asks & going_on).squeeze(-1))
+        state["n_offered"] += going_on
+        reward = torch.where(asks, gain, -gain)
+        return self._finish(state, reward, truncated=state["n_offered"] >= self.n_offers)
+
+
+def _spec_of(state: TensorDictBase) -> Composite:
+    """Unbounded specs of the shapes and types in a state."""
+    spec = Composite(shape=state.batch_size, device=state.device)
+    for key, value in state.items(include_nested=True, leaves_only=True):
+        if value.dtype == torch.bool:
+            spec[key] = Binary(n=value.shape[-1], shape=value.shape, dtype=torch.bool)
+        else:
+            spec[key] = Unbounded(shape=value.shape, dtype=value.dtype)
+    return spec.to(state.device)

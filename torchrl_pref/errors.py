@@ -1,0 +1,76 @@
+"""What a user did wrong, said in one line: what came, what was expected, how to mend it."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+
+class InputError(ValueError):
+    """Input that cannot be used. The message is one line, written for the person who gave it."""
+
+
+def check_count(name: str, value: Any, minimum: int) -> int:
+    """Return ``value`` if it is a whole number of at least ``minimum``.
+
+    Raises:
+        InputError: it is not.
+    """
+    if isinstance(value, bool) or not isinstance(value, int) or value < minimum:
+        raise InputError(
+            f"{name}={value!r}: expected a whole number of at least {minimum}; "
+            f"set {name}={minimum} or more"
+        )
+    return value
+
+
+def check_positive(name: str, value: Any) -> float:
+    """Return ``value`` as a float if it is a finite number above zero.
+
+    Raises:
+        InputError: it is not.
+    """
+    number = not isinstance(value, bool) and isinstance(value, (int, float))
+    if not number or not math.isfinite(value) or value <= 0:
+        raise InputError(f"{name}={value!r}: expected a finite number above 0, such as {name}=1.0")
+    return float(value)
+
+
+def check_share(name: str, value: Any) -> float:
+    """Return ``value`` as a float if it is a number from 0 to 1.
+
+    Raises:
+        InputError: it is not.
+    """
+    number = not isinstance(value, bool) and isinstance(value, (int, float))
+    if not number or not 0 <= value <= 1:
+        raise InputError(f"{name}={value!r}: expected a number from 0 to 1, such as {name}=0.5")
+    return float(value)
+
+
+def check_choice(name: str, value: Any, choices: tuple[str, ...]) -> str:
+    """Return ``value`` if it is one of ``choices``.
+
+    Raises:
+        InputError: it is not.
+    """
+    if value not in choices:
+        options = " or ".join(f"{name}={choice}" for choice in choices)
+        raise InputError(f"{name}={value!r}: expected one of {', '.join(choices)}; set {options}")
+    return str(value)
+
+
+@contextmanager
+def one_line_errors() -> Iterator[None]:
+    """End the program with status 2 and one line on stderr where the input was at fault.
+
+    Everything else is a defect of ours and keeps its traceback.
+    """
+    try:
+        yield
+    except (InputError, OSError) as error:
+        print("error: " + " ".join(str(error).split()), file=sys.stderr)
+        raise SystemExit(2) from None

@@ -1,0 +1,52 @@
+"""Who answers the queries.
+
+Shapes: B sessions, H query budget, K options per query, R possible answers, D features.
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Generator, Tensor
+
+from torchrl_pref.belief import uniform_sphere
+from torchrl_pref.responses import ResponseModel
+
+
+class SimulatedHuman:
+    """A human with hidden weights ω, uniform on the unit sphere, who answers by a response model.
+
+    All the randomness of the answers is drawn with ω, one draw for each of the H answers to come:
+    two strategies that face the same human also face the same luck, and their difference is paired.
+
+    Args:
+        response_model: how the human answers.
+    """
+
+    def __init__(self, response_model: ResponseModel) -> None:
+        self.response_model = response_model
+
+    def draw(
+        self, n_sessions: int, budget: int, n_options: int, n_features: int, generator: Generator
+    ) -> TensorDict:
+        """Draw B humans: ``omega`` (B D) and ``noise`` (B H R), standard Gumbel."""
+        omega = uniform_sphere((n_sessions, n_features), generator)
+        shape = (n_sessions, budget, n_options)
+        exponential = torch.empty(shape, device=generator.device).exponential_(generator=generator)
+        noise = -exponential.clamp(min=1e-30).log()
+        return TensorDict({"omega": omega, "noise": noise}, [n_sessions], device=generator.device)
+
+    def respond(self, queries: Tensor, human: TensorDictBase, turn: Tensor) -> Tensor:
+        """Pick one option of a query, by the Gumbel-max trick.
+
+        Args:
+            queries: (B K D), features of the options.
+            human: ``omega`` and ``noise`` as drawn.
+            turn: (B), how many queries each human has answered before.
+
+        Returns:
+            (B) int64, the index of the chosen option.
+        """
+        returns = (queries @ human["omega"].unsqueeze(-1)).squeeze(-1)
+        noise = torch.take_along_dim(human["noise"], turn[:, None, None], 1).squeeze(1)
+        return (self.response_model(returns) + noise).argmax(-1)

@@ -1,0 +1,143 @@
+"""Query pools: N queries of K options with D features each.
+
+Shapes: N queries, K options per query, D features, T trajectory length.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pickle
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchrl_pref.errors import InputError, check_count
+from torchrl_pref.features import check_features, corner_distances
+from torchrl_pref.gridworld import random_walks
+
+
+@dataclass(frozen=True)
+class QueryPool:
+    """A fixed set of queries to choose from.
+
+    Attributes:
+        features: (N K D) float32.
+        trajectories: (N K T …), what a person would be shown, or None.
+
+    Raises:
+        InputError: the features are not (N, K ≥ 2, D ≥ 2) finite numbers, or the trajectories do
+            not belong to them.
+    """
+
+    features: Tensor
+    trajectories: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "features", check_features(self.features))
+        shown = self.trajectories
+        if shown is not None and shown.shape[:2] != self.features.shape[:2]:
+            raise InputError(
+                f"trajectories of shape {tuple(shown.shape)}: expected "
+                f"{tuple(self.features.shape[:2])} as the first two sizes, those of the features"
+            )
+
+    def __len__(self) -> int:
+        return len(self.features)
+
+    @property
+    def n_options(self) -> int:
+        """K."""
+        return self.features.shape[1]
+
+    @property
+    def n_features(self) -> int:
+        """D."""
+        return self.features.shape[2]
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the features and their shape, in hexadecimal: equal pools, equal digests."""
+        content = self.features.contiguous().cpu().numpy()
+        return hashlib.sha256(repr(content.shape).encode() + content.tobytes()).hexdigest()
+
+    def map_features(self, function: Callable[[Tensor], Tensor]) -> QueryPool:
+        """The same queries with other features, such as those of a ``Normalizer``."""
+        return replace(self, features=function(self.features))
+
+    def save(self, path: str | Path) -> None:
+        """Write the pool to a file, whole or not at all."""
+        content = {"features": self.features, "trajectories": self.trajectories}
+        save_atomically({"kind": "query pool", **content}, path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> QueryPool:
+        """Read a pool from a file. No pickled code is ever executed.
+
+        Raises:
+            InputError: the file is missing, cut off, or not a query pool.
+        """
+        content = load_safely(path, "query pool")
+        features = content.get("features")
+        if not isinstance(features, Tensor):
+            raise InputError(f"{path}: a query pool without features; make it again with save()")
+        return cls(features, content.get("trajectories"))
+
+
+def gridworld_pool(
+    n_queries: int = 1000, n_options: int = 2, size: int = 8, length: int = 20, seed: int = 0
+) -> QueryPool:
+    """The paper's pool: K random walks a query, mean distances to the corners, not normalised.
+
+    Args:
+        n_queries: N, at least 1.
+        n_options: K, at least 2.
+        size: cells along an edge of the Gridworld.
+        length: T, cells in a walk.
+        seed: fixes the pool.
+
+    Raises:
+        InputError: a number is below its minimum.
+    """
+    check_count("pool.size", n_queries, 1)
+    check_count("pool.options", n_options, 2)
+    walks = random_walks(n_queries * n_options, size, length, seed)
+    features = corner_distances(walks, size)
+    shape = (n_queries, n_options)
+    return QueryPool(features.unflatten(0, shape), walks.unflatten(0, shape))
+
+
+def save_atomically(content: dict[str, Any], path: str | Path) -> None:
+    """Write plain data and tensors to a file, so that a reader never sees half of it."""
+    path = Path(path)
+    partial = path.with_name(path.name + ".partial")
+    try:
+        torch.save(content, partial)
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def load_safely(path: str | Path, kind: str) -> dict[str, Any]:
+    """Read what :func:`save_atomically` wrote, with ``weights_only=True``.
+
+    Raises:
+        InputError: the file is missing, unreadable, or of another kind.
+    """
+    if not Path(path).is_file():
+        raise InputError(f"{path}: no such file; expected a {kind}; check the path")
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except (RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError) as error:
+        raise InputError(
+            f"{path}: cannot be read as a {kind} (cut off, or not a file of plain tensors); "
+            "expected a file written by this package; make it again or restore a copy"
+        ) from error
+    found = content.get("kind") if isinstance(content, dict) else None
+    if found != kind:
+        raise InputError(f"{path}: holds {found or 'something else'}; expected a {kind}")
+    return content

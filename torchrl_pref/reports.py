@@ -1,0 +1,240 @@
+"""Tables, figures and files of an evaluation."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import matplotlib
+import torch
+from tabulate import tabulate
+from torch import Tensor
+
+from torchrl_pref.evaluation import CURVES, Evaluation, bootstrap_interval
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+Results = Mapping[str, Evaluation]
+
+STYLE = {
+    "random": ("#7f7f7f", "--"),
+    "greedy": ("#1f1f1f", "-"),
+    "ask all": ("#a65628", ":"),
+    "RL": ("#0072b2", "-"),
+    "RL-feed": ("#d55e00", "-"),
+}
+"""Colour (Okabe and Ito's, told apart by colour-blind readers) and line of each strategy."""
+
+NAMES = {"greedy": "greedy information gain", "ask all": "ask all (feed)"}
+
+
+def milestones(budget: int) -> list[int]:
+    """The numbers of queries that tables report: 5, 10 and 20 of 20, in proportion otherwise."""
+    return sorted({max(1, round(budget * share)) for share in (0.25, 0.5, 1.0)})
+
+
+def alignment_table(results: Results, style: str = "simple") -> str:
+    """The headline table: alignment, its interval and paired differences, one strategy a row."""
+    budget = next(iter(results.values())).alignment.shape[1] - 1
+    columns = milestones(budget)
+    rows = []
+    for name, result in results.items():
+        final = result.alignment[:, -1]
+        rows.append(
+            [
+                NAMES.get(name, name),
+                *(f"{result.alignment[:, j].mean():.3f}" for j in columns),
+                "{:.3f} to {:.3f}".format(*bootstrap_interval(final)),
+                *(
+                    "" if name == other else _difference(final - results[other].alignment[:, -1])
+                    for other in ("greedy", "random")
+                ),
+            ]
+        )
+    headers = [
+        "strategy",
+        *(f"after {j}" for j in columns),
+        "95% interval",
+        "less greedy [95%]",
+        "less random [95%]",
+    ]
+    return tabulate(rows, headers, tablefmt=style, disable_numparse=True)
+
+
+def detail_table(results: Results, style: str = "simple") -> str:
+    """What else was measured after the last query, one strategy a row."""
+    rows = []
+    for name, result in results.items():
+        rows.append(
+            [
+                NAMES.get(name, name),
+                f"{result.alignment[:, -1].mean():.3f}",
+                f"{result.alignment_of_mean[:, -1].mean():.3f}",
+                f"{result.information[:, -1].mean():.2f}",
+                f"{result.ess[:, 1:].mean():.0f}",
+                f"{result.asked.float().mean():.1f}",
+                f"{result.offered.float().mean():.1f}",
+                f"{result.repeated.float().mean():.1f}",
+                f"{1000 * result.seconds_per_query:.2f}",
+            ]
+        )
+    headers = ["strategy", "mean of cosines", "cosine of mean", "bits", "ESS"]
+    headers += ["asked", "offered", "repeated", "ms a query"]
+    return tabulate(rows, headers, tablefmt=style, disable_numparse=True)
+
+
+def _difference(paired: Tensor) -> str:
+    """Mean and interval of a paired difference."""
+    return "{:+.3f} [{:+.3f}, {:+.3f}]".format(float(paired.mean()), *bootstrap_interval(paired))
+
+
+def write_curves(panels: Mapping[str, Results], path: Path) -> None:
+    """Write every curve as CSV: panel, strategy, queries asked, metric, mean and 95% interval."""
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["panel", "strategy", "queries", "metric", "mean", "low", "high"])
+        for panel, results in panels.items():
+            for name, result in results.items():
+                for metric in CURVES:
+                    for j, values in enumerate(getattr(result, metric).unbind(1)):
+                        numbers = [float(values.mean()), *bootstrap_interval(values)]
+                        writer.writerow(
+                            [panel, name, j, metric, *(f"{number:.5f}" for number in numbers)]
+                        )
+
+
+def figure_1(panels: Mapping[str, Results], path: Path) -> None:
+    """The paper's Figure 1: alignment against the number of queries, one panel a kind of human."""
+    figure, axes = plt.subplots(
+        1, len(panels), figsize=(1 + 4.6 * len(panels), 4), sharey=True, squeeze=False
+    )
+    for axis, (title, results) in zip(axes[0], panels.items(), strict=True):
+        for name, result in results.items():
+            _draw_curve(axis, name, result.alignment)
+        axis.set(title=title, xlabel="queries asked", xlim=(0, None), ylim=(None, 1))
+        axis.xaxis.get_major_locator().set_params(integer=True)
+        axis.grid(alpha=0.25)
+    axes[0][0].set_ylabel("alignment (mean of cosines)")
+    axes[0][-1].legend(frameon=False, loc="lower right")
+    _save(figure, path)
+
+
+def _draw_curve(axis: Axes, name: str, values: Tensor) -> None:
+    """Mean over humans and its 95% interval."""
+    color, line = STYLE.get(name, (None, "-"))
+    means = values.mean(0)
+    intervals = torch.tensor([bootstrap_interval(column) for column in values.unbind(1)])
+    queries = range(len(means))
+    (drawn,) = axis.plot(queries, means, line, color=color, label=NAMES.get(name, name))
+    axis.fill_between(
+        queries, intervals[:, 0], intervals[:, 1], color=drawn.get_color(), alpha=0.15, lw=0
+    )
+
+
+def figure_2(histories: Mapping[str, Sequence[float]], path: Path) -> None:
+    """The paper's Figure 2: mean length of the training episodes against the number of updates."""
+    figure, axis = plt.subplots(figsize=(5.6, 4))
+    for name, values in histories.items():
+        axis.plot(*smoothed(values), label=name)
+    axis.set(xlabel="A2C updates", ylabel="training episode length (offers)")
+    axis.grid(alpha=0.25)
+    axis.legend(frameon=False)
+    _save(figure, path)
+
+
+def training_figure(history: Mapping[str, Sequence[float]], path: Path) -> None:
+    """How training went: alignment, episode length and reward against the number of updates."""
+    names = [name for name in history if name.startswith("train/")]
+    figure, axes = plt.subplots(1, len(names), figsize=(4.2 * len(names), 3.4))
+    for axis, name in zip(axes, names, strict=True):
+        axis.plot(*smoothed(history[name]), color=STYLE["RL"][0])
+        label = name.removeprefix("train/").replace("_", " ")
+        axis.set(xlabel="A2C updates", ylabel=f"{label} at the end of an episode")
+        axis.grid(alpha=0.25)
+    _save(figure, path)
+
+
+def write_report(
+    folder: Path,
+    panels: Mapping[str, Results],
+    histories: Mapping[str, Mapping[str, Sequence[float]]],
+) -> None:
+    """Print the tables of each panel; write tables, curves and figures to a folder and say where.
+
+    Args:
+        folder: an existing folder.
+        panels: evaluations by strategy, by the title of the panel.
+        histories: training metrics by the name of the learned policy; may be empty.
+    """
+    tables = []
+    for title, results in panels.items():
+        tables += [title, "", alignment_table(results), "", detail_table(results), ""]
+    text = "\n".join(tables)
+    print("\n" + text)
+    (folder / "tables.txt").write_text(text)
+    write_curves(panels, folder / "curves.csv")
+    figure_1(panels, folder / "figure_1.png")
+    written = ["tables.txt", "curves.csv", "figure_1.png"]
+    lengths = {
+        name: history["train/episode_length"]
+        for name, history in histories.items()
+        if name.startswith("RL-feed")
+    }
+    if lengths:
+        figure_2(lengths, folder / "figure_2.png")
+        written.append("figure_2.png")
+    if len(histories) == 1:
+        training_figure(next(iter(histories.values())), folder / "training.png")
+        written.append("training.png")
+    print(f"written to {folder}: {', '.join(written)}")
+
+
+def write_summary(folder: Path, overrides: Sequence[str], result: Evaluation) -> None:
+    """Write what :func:`sweep_table` gathers: the keys typed and the policy's final numbers."""
+    numbers = {
+        f"alignment after {j}": round(float(result.alignment[:, j].mean()), 4)
+        for j in milestones(result.alignment.shape[1] - 1)
+    }
+    numbers["bits"] = round(float(result.information[:, -1].mean()), 3)
+    numbers["asked"] = round(float(result.asked.float().mean()), 2)
+    content = {"overrides": list(overrides), **numbers}
+    (folder / "summary.json").write_text(json.dumps(content, indent=1) + "\n")
+
+
+def sweep_table(folder: Path) -> str:
+    """One row for each finished job of a sweep; also written to the sweep's ``summary.csv``."""
+    rows = []
+    for path in sorted(folder.glob("*/summary.json"), key=lambda path: path.parent.name.zfill(9)):
+        content = json.loads(path.read_text())
+        keys = dict(override.split("=", 1) for override in content.pop("overrides"))
+        rows.append({"job": path.parent.name, **keys, **content})
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    with (folder / "summary.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, names, restval="")
+        writer.writeheader()
+        writer.writerows(rows)
+    return f"\nsweep so far, {folder / 'summary.csv'}\n" + tabulate(rows, headers="keys")
+
+
+def smoothed(values: Sequence[float], points: int = 100) -> tuple[list[float], list[float]]:
+    """Means of about ``points`` equal stretches, and the updates they are centred on."""
+    width = max(1, len(values) // points)
+    middles, means = [], []
+    for start in range(0, len(values), width):
+        known = [value for value in values[start : start + width] if not math.isnan(value)]
+        if known:
+            middles.append(start + (min(width, len(values) - start) + 1) / 2)
+            means.append(sum(known) / len(known))
+    return middles, means
+
+
+def _save(figure: Figure, path: Path) -> None:
+    figure.tight_layout()
+    figure.savefig(path, dpi=150)
+    plt.close(figure)

@@ -1,0 +1,142 @@
+"""Response models: how likely each answer to a query is, given the returns of its options.
+
+Shapes: K options, R possible answers (here R = K), ``…`` any leading dimensions.
+
+A response model is the one place where a likelihood is written. The belief, the acquisition
+functions, the simulated humans and the calibration of ``tau`` all call it.
+
+``tau`` *multiplies* the returns (it is an inverse temperature, also called rationality): a large
+``tau`` means a careful human. Other libraries divide by it.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from torchrl_pref.errors import InputError, check_positive
+
+
+class ResponseModel(ABC):
+    """The probability of an answer. It sees returns only, so it serves any task and any D."""
+
+    @abstractmethod
+    def log_likelihood(self, gaps: Tensor) -> Tensor:
+        """Log-probability that an option is chosen.
+
+        Args:
+            gaps: (… K-1), by how much the option's return exceeds that of each other option.
+
+        Returns:
+            (…), natural logarithm.
+        """
+
+    def __call__(self, returns: Tensor) -> Tensor:
+        """Log-probability of each answer.
+
+        Args:
+            returns: (… K), the return of each option.
+
+        Returns:
+            (… R), natural logarithm; each row's exponentials sum to one.
+        """
+        columns = returns.unbind(-1)
+        log_probs = []
+        for k, chosen in enumerate(columns):
+            others = [chosen - other for j, other in enumerate(columns) if j != k]
+            log_probs.append(self.log_likelihood(torch.stack(others, -1)))
+        # Answers outermost in memory: what follows reduces over samples, one answer at a time.
+        return torch.stack(log_probs).movedim(0, -1)
+
+
+class Boltzmann(ResponseModel):
+    r"""The paper's noisily rational human (section 3.2).
+
+    .. math:: P(q = \xi_i \mid Q, \omega) =
+        \frac{\exp \tau R(\xi_i)}{\sum_{\xi \in Q} \exp \tau R(\xi)}
+
+    Args:
+        tau: what the returns are multiplied by; above 0. Larger is less noisy.
+
+    Raises:
+        InputError: ``tau`` is not a finite number above zero.
+    """
+
+    def __init__(self, tau: float) -> None:
+        self.tau = check_positive("tau", tau)
+
+    def log_likelihood(self, gaps: Tensor) -> Tensor:
+        """See :meth:`ResponseModel.log_likelihood`."""
+        if gaps.shape[-1] == 1:
+            return F.logsigmoid(self.tau * gaps.squeeze(-1))
+        return -torch.logsumexp(F.pad(-self.tau * gaps, (1, 0)), -1)
+
+    def __call__(self, returns: Tensor) -> Tensor:
+        """See :meth:`ResponseModel.__call__`."""
+        if returns.shape[-1] == 2:
+            return super().__call__(returns)
+        return torch.log_softmax(self.tau * returns, -1)
+
+    def __repr__(self) -> str:
+        return f"Boltzmann(tau={self.tau:g})"
+
+
+class Optimal(ResponseModel):
+    """The paper's optimal user, the limit of ``Boltzmann`` as tau grows: argmax, ties uniform.
+
+    Args:
+        tolerance: gaps this small count as ties. It absorbs the rounding of float32 returns, so a
+            belief never excludes the very human who answered. In the units of the return.
+    """
+
+    def __init__(self, tolerance: float = 1e-6) -> None:
+        self.tolerance = tolerance
+
+    def log_likelihood(self, gaps: Tensor) -> Tensor:
+        """See :meth:`ResponseModel.log_likelihood`."""
+        ties = 1 + (gaps.abs() <= self.tolerance).sum(-1)
+        beaten = (gaps < -self.tolerance).any(-1)
+        return torch.where(beaten, -math.inf, -ties.to(gaps.dtype).log())
+
+    def __repr__(self) -> str:
+        return "Optimal()"
+
+
+def accuracy(tau: float, returns: Tensor) -> float:
+    """Mean probability that a Boltzmann human picks the best option.
+
+    Args:
+        tau: the human's tau.
+        returns: (… K), returns of the options of each query under each human.
+    """
+    gaps = returns.max(-1, keepdim=True).values - returns
+    others = gaps.sort(-1).values[..., 1:]
+    return Boltzmann(tau).log_likelihood(others).exp().mean(dtype=torch.float64).item()
+
+
+def calibrate_tau(returns: Tensor, target: float = 0.9) -> float:
+    """The tau at which the best option is picked with probability ``target`` on average.
+
+    This is what "noisy user (90%)" of the paper's Figure 1 is taken to mean.
+
+    Args:
+        returns: (… K), returns of the options of the training pool under humans of the prior.
+        target: mean accuracy, above 1/K and below 1.
+
+    Raises:
+        InputError: no tau up to 10⁶ reaches the target (most options tie).
+    """
+    low, high = 1e-6, 1e6
+    if not accuracy(low, returns) < target < accuracy(high, returns):
+        raise InputError(
+            f"an accuracy of {target} cannot be reached: tau between {low:g} and {high:g} gives "
+            f"{accuracy(low, returns):.3f} to {accuracy(high, returns):.3f}; give tau as a number"
+        )
+    while high / low > 1 + 1e-6:
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if accuracy(middle, returns) < target else (low, middle)
+    return math.sqrt(low * high)

@@ -1,0 +1,251 @@
+"""Advantage actor-critic (A2C) on either environment, with TorchRL's collector, GAE and loss.
+
+Shapes: B sessions side by side, T steps of each in a batch.
+"""
+
+from __future__ import annotations
+
+import math
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch.nn.utils import clip_grad_norm_
+from torchrl.collectors import Collector
+from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
+from torchrl.objectives import A2CLoss
+from torchrl.objectives.value import GAE
+from torchrl.record.loggers import Logger, get_logger
+from tqdm import tqdm
+
+from torchrl_pref.envs import FeedEnv, QueryEnv
+from torchrl_pref.errors import check_choice, check_count, check_positive, check_share
+from torchrl_pref.policies import Policy
+
+LOGGERS = ("csv", "tensorboard")
+
+METRICS = {
+    "train/alignment": ("metrics", "alignment"),
+    "train/episode_length": "step_count",
+    "train/reward": "episode_reward",
+}
+"""What is averaged over the episodes that end in a batch, by the key that holds it."""
+
+
+@dataclass(frozen=True)
+class A2CSettings:
+    """The constants of A2C.
+
+    Attributes:
+        updates: gradient steps in all.
+        sessions: B, humans questioned side by side.
+        steps: T, steps of each session between two updates.
+        optimizer: ``adam`` or ``rmsprop``.
+        learning_rate: of the optimizer.
+        gamma: discount of the reward.
+        lmbda: of generalised advantage estimation; 1 is the plain advantage.
+        entropy: coefficient of the entropy bonus.
+        critic: coefficient of the critic's squared error.
+        grad_norm: the gradient is clipped to this length.
+        save_every: updates between two checkpoints.
+
+    Raises:
+        InputError: a constant is out of range.
+    """
+
+    updates: int
+    sessions: int
+    steps: int
+    optimizer: str
+    learning_rate: float
+    gamma: float
+    lmbda: float
+    entropy: float
+    critic: float
+    grad_norm: float
+    save_every: int
+
+    def __post_init__(self) -> None:
+        for name in ("updates", "sessions", "steps", "save_every"):
+            check_count(f"training.{name}", getattr(self, name), 1)
+        for name in ("learning_rate", "critic", "grad_norm"):
+            check_positive(f"training.{name}", getattr(self, name))
+        for name in ("gamma", "lmbda", "entropy"):
+            check_share(f"training.{name}", getattr(self, name))
+        check_choice("training.optimizer", self.optimizer, ("adam", "rmsprop"))
+
+
+@dataclass
+class Progress:
+    """How far a training run has come.
+
+    Attributes:
+        update: updates done.
+        history: one value an update for each metric, NaN where no episode ended.
+    """
+
+    update: int = 0
+    history: dict[str, list[float]] = field(
+        default_factory=lambda: {name: [] for name in (*METRICS, "time/frames_per_second")}
+    )
+
+
+class Trainer:
+    """The state of a training run, and the loop.
+
+    Args:
+        env: where to learn; its batch size is B.
+        policy: what learns.
+        settings: the constants of A2C.
+        seed: fixes the actions; the environment has its own seed. On the CPU the two fix every bit.
+    """
+
+    def __init__(
+        self, env: QueryEnv | FeedEnv, policy: Policy, settings: A2CSettings, seed: int
+    ) -> None:
+        torch.manual_seed(seed)
+        self.env, self.policy, self.settings = env, policy, settings
+        self.progress = Progress()
+        self.advantage = GAE(
+            gamma=settings.gamma,
+            lmbda=settings.lmbda,
+            value_network=policy.critic,
+            vectorized=False,
+        )
+        self.loss = A2CLoss(
+            actor_network=policy.actor,
+            critic_network=policy.critic,
+            entropy_coeff=settings.entropy,
+            critic_coeff=settings.critic,
+            loss_critic_type="l2",
+        )
+        self.optimizer: torch.optim.Optimizer
+        if settings.optimizer == "adam":
+            self.optimizer = torch.optim.Adam(self.loss.parameters(), settings.learning_rate)
+        else:
+            self.optimizer = torch.optim.RMSprop(
+                self.loss.parameters(), settings.learning_rate, alpha=0.99, eps=1e-5
+            )
+        transforms = Compose(RewardSum(), StepCounter())
+        self.collector = Collector(
+            TransformedEnv(env, transforms),
+            policy.strategy,
+            frames_per_batch=settings.sessions * settings.steps,
+            total_frames=-1,
+            track_traj_ids=False,
+        )
+
+    def run(self, folder: Path, save: Callable[[], None]) -> bool:
+        """Train until the last update, or until Ctrl-C.
+
+        Args:
+            folder: where the logs go.
+            save: called every ``save_every`` updates, at the end and at Ctrl-C.
+
+        Returns:
+            Whether training ran to its end.
+        """
+        settings, progress = self.settings, self.progress
+        loggers = [_open_logger(kind, folder, progress.update) for kind in LOGGERS]
+        bar = tqdm(total=settings.updates, initial=progress.update, desc="training", unit="update")
+        with bar, _stop_request() as stopped:
+            batches = iter(self.collector)
+            while progress.update < settings.updates and not stopped():
+                start = time.perf_counter()
+                batch = next(batches)
+                self.update(batch)
+                progress.update += 1
+                metrics = _episode_metrics(batch)
+                metrics["time/frames_per_second"] = batch.numel() / (time.perf_counter() - start)
+                for name, value in metrics.items():
+                    progress.history[name].append(value)
+                    if not math.isnan(value):
+                        for logger in loggers:
+                            logger.log_scalar(name, value, step=progress.update)
+                bar.update()
+                bar.set_postfix(_latest(progress.history), refresh=False)
+                if progress.update % settings.save_every == 0:
+                    save()
+            save()
+        return progress.update >= settings.updates
+
+    def update(self, batch: TensorDictBase) -> None:
+        """One A2C step on a batch (B T) of transitions."""
+        with torch.no_grad():
+            self.advantage(batch)
+        losses = self.loss(batch.reshape(-1))
+        total = sum(value for key, value in losses.items() if key.startswith("loss_"))
+        self.optimizer.zero_grad()
+        total.backward()
+        clip_grad_norm_(self.loss.parameters(), self.settings.grad_norm)
+        self.optimizer.step()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Plain data and tensors that :meth:`load_state_dict` goes on from, bit for bit."""
+        # TorchRL's collector state holds no environment state; ours is all in its carrier.
+        return {
+            "update": self.progress.update,
+            "history": self.progress.history,
+            "optimizer": self.optimizer.state_dict(),
+            "sessions": self.collector._carrier.to_dict(),
+            "env_generator": self.env.generator.get_state(),
+            "global_generator": torch.get_rng_state(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on where :meth:`state_dict` was taken; the policy's weights are loaded apart."""
+        self.progress = Progress(state["update"], state["history"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        sessions = TensorDict(state["sessions"], self.env.batch_size, device=self.env.device)
+        self.collector._carrier.update(sessions)
+        self.env.generator.set_state(state["env_generator"])
+        torch.set_rng_state(state["global_generator"])
+
+
+def _episode_metrics(batch: TensorDictBase) -> dict[str, float]:
+    """Means over the episodes that ended in a batch; NaN where none did."""
+    done = batch["next", "done"]
+    return {name: batch["next", key][done].float().mean().item() for name, key in METRICS.items()}
+
+
+def _latest(history: dict[str, list[float]]) -> dict[str, str]:
+    """The last number of each metric, for the progress bar."""
+    latest = {}
+    for name, values in history.items():
+        known = (value for value in reversed(values) if not math.isnan(value))
+        latest[name.split("/")[-1]] = f"{next(known, math.nan):.3g}"
+    return latest
+
+
+def _open_logger(kind: str, folder: Path, update: int) -> Logger:
+    """A TorchRL logger; CSV rows that a resumed run will write again are dropped first."""
+    for path in (folder / "csv" / "scalars").rglob("*.csv") if kind == "csv" else ():
+        rows = path.read_text().splitlines(keepends=True)
+        path.write_text("".join(row for row in rows if int(row.split(",")[0]) <= update))
+    logger = get_logger(kind, logger_name=str(folder), experiment_name=kind)
+    assert logger is not None
+    return logger
+
+
+@contextmanager
+def _stop_request() -> Iterator[Callable[[], bool]]:
+    """Turn the first Ctrl-C into a request to stop after the current update."""
+    requested = False
+
+    def request(number: int, frame: FrameType | None) -> None:
+        nonlocal requested
+        requested = True
+        signal.signal(signal.SIGINT, before)
+
+    before = signal.signal(signal.SIGINT, request)
+    try:
+        yield lambda: requested
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -5,9 +5,8 @@ Shapes: S sessions, M samples, H answers, K options per query, D features.
 The prior is uniform on the unit sphere: alignment ignores the scale of ω, and tau carries it.
 After each answer the samples take a step of *resample-move* (Gilks and Berzuini, 2001): reweight by
 the likelihood of the new answer, resample, then move every sample with Markov steps that leave the
-new posterior invariant. The Markov step is a shrinking slice sampler along a great circle (Neal,
-2003; Habeck, Hasenpflug, Kodgirwar and Rudolf, 2023). It has no step size to tune and respects hard
-answers. An answer that too few samples agree with is let in by stages, see :meth:`Belief.update`.
+new posterior invariant (see ``sampler.py``). An answer that too few samples agree with is let in by
+stages, see :meth:`Belief.update`.
 """
 
 from __future__ import annotations
@@ -21,9 +20,7 @@ from torch.nn import functional as F
 
 from torchrl_pref.errors import check_count
 from torchrl_pref.responses import ResponseModel
-
-MAX_SHRINKS = 60
-"""The bracket starts at 2π and about halves each time: 60 halvings reach the limit of float32."""
+from torchrl_pref.sampler import great_circle_step
 
 MAX_STAGES = 30
 """An answer that fewer than 1 in 4³⁰ of the belief agree with contradicts the earlier answers."""
@@ -184,63 +181,9 @@ class Belief:
             pole = torch.randn(start.shape, generator=generator, device=start.device)
             if step % 2:
                 pole = pole @ scale.mT
-            moved = self._great_circle_move(moved, pole, answers, slack, generator)
+            moved = great_circle_step(moved, pole, answers, slack, self.response_model, generator)
         kept = _correlation(start, moved).clamp(min=0).square()
-        return moved, 1 + kept * (inflation - 1)
-
-    def _great_circle_move(
-        self, samples: Tensor, pole: Tensor, answers: Tensor, slack: Tensor, generator: Generator
-    ) -> Tensor:
-        """One slice-sampling step of every sample along its great circle through a pole.
-
-        On the great circle through ω and a pole u drawn independently of ω, the prior has density
-        |sin ∠(ω, u)|^(D-2): the meridians of a sphere crowd at its poles.
-        """
-        n_sessions, n_samples, n_features = samples.shape
-        along = (pole * samples).sum(-1, keepdim=True)
-        across = pole - along * samples
-        height = across.norm(dim=-1, keepdim=True).clamp(min=1e-20)
-        tangent = across / height
-        pole_angle = torch.atan2(height, along).reshape(-1)
-
-        flat = answers.flatten(1, 2).mT
-        shape = (n_sessions * n_samples, *answers.shape[1:3])
-        cosine, sine = (samples @ flat).view(shape), (tangent @ flat).view(shape)
-        raise_newest = slack.repeat_interleave(n_samples)
-
-        def log_density(angle: Tensor, cosine: Tensor, sine: Tensor, raised: Tensor) -> Tensor:
-            gaps = cosine * angle.cos()[:, None, None] + sine * angle.sin()[:, None, None]
-            gaps[:, -1] += raised[:, None]
-            return self.response_model.log_likelihood(gaps).sum(-1)
-
-        def log_meridian(angle: Tensor, pole_angle: Tensor) -> Tensor:
-            return (n_features - 2) * (pole_angle - angle).sin().abs().clamp(min=1e-30).log()
-
-        zero = torch.zeros_like(pole_angle)
-        here = log_density(zero, cosine, sine, raise_newest) + log_meridian(zero, pole_angle)
-        uniform = torch.rand((2, *zero.shape), generator=generator, device=zero.device)
-        threshold = here + uniform[0].log()
-        high = 2 * math.pi * uniform[1]
-        low = high - 2 * math.pi
-        angles = zero.clone()
-        todo = torch.arange(len(zero), device=zero.device)
-        for _ in range(MAX_SHRINKS):
-            fraction = torch.rand(todo.shape, generator=generator, device=zero.device)
-            angle = low + (high - low) * fraction
-            value = log_density(angle, cosine, sine, raise_newest) + log_meridian(angle, pole_angle)
-            accepted = (value >= threshold) & (value > -math.inf)
-            angles[todo[accepted]] = angle[accepted]
-            left = ~accepted
-            todo = todo[left]
-            if todo.numel() == 0:
-                break
-            angle = angle[left]
-            high = torch.where(angle > 0, angle, high[left])
-            low = torch.where(angle > 0, low[left], angle)
-            cosine, sine, raise_newest = cosine[left], sine[left], raise_newest[left]
-            pole_angle, threshold = pole_angle[left], threshold[left]
-        turn = angles.view(n_sessions, n_samples, 1)
-        return F.normalize(samples * turn.cos() + tangent * turn.sin(), dim=-1)
+        return moved, (1 + kept * (inflation - 1)).clamp(max=self.n_samples)
 
 
 def kish_share(log_weights: Tensor) -> Tensor:

@@ -35,6 +35,19 @@ class ResponseModel(ABC):
             (…), natural logarithm.
         """
 
+    @abstractmethod
+    def least_gap(self, log_likelihood: Tensor) -> Tensor:
+        """The smallest gap to any other option at which an answer can be this likely.
+
+        A bound, by which the belief's sampler knows where not to look: it need not be attained.
+
+        Args:
+            log_likelihood: (…), at most 0.
+
+        Returns:
+            (…), in the units of the return.
+        """
+
     def __call__(self, returns: Tensor) -> Tensor:
         """Log-probability of each answer.
 
@@ -75,6 +88,12 @@ class Boltzmann(ResponseModel):
             return F.logsigmoid(self.tau * gaps.squeeze(-1))
         return -torch.logsumexp(F.pad(-self.tau * gaps, (1, 0)), -1)
 
+    def least_gap(self, log_likelihood: Tensor) -> Tensor:
+        """See :meth:`ResponseModel.least_gap`; the option beats each other one at least so often."""
+        # The inverse of log σ(τ g); for very unlikely answers exp(-ℓ) - 1 is exp(-ℓ).
+        surprise = -log_likelihood
+        return -(surprise + torch.log(-torch.expm1(-surprise))) / self.tau
+
     def __call__(self, returns: Tensor) -> Tensor:
         """See :meth:`ResponseModel.__call__`."""
         if returns.shape[-1] == 2:
@@ -101,6 +120,10 @@ class Optimal(ResponseModel):
         ties = 1 + (gaps.abs() <= self.tolerance).sum(-1)
         beaten = (gaps < -self.tolerance).any(-1)
         return torch.where(beaten, -math.inf, -ties.to(gaps.dtype).log())
+
+    def least_gap(self, log_likelihood: Tensor) -> Tensor:
+        """See :meth:`ResponseModel.least_gap`."""
+        return torch.full_like(log_likelihood, -self.tolerance)
 
     def __repr__(self) -> str:
         return "Optimal()"

@@ -1,0 +1,28 @@
+import pytest
+import torch
+from torch import Generator
+
+from torchrl_pref.belief import Belief
+from torchrl_pref.features import Normalizer
+from torchrl_pref.queries import QueryPool, gridworld_pool
+from torchrl_pref.responses import Boltzmann, Optimal
+
+torch.set_num_threads(1)
+
+RESPONSE_MODELS = [Boltzmann(4.4), Optimal()]
+
+
+@pytest.fixture
+def generator() -> Generator:
+    return Generator().manual_seed(0)
+
+
+@pytest.fixture(scope="session")
+def pool() -> QueryPool:
+    raw = gridworld_pool(60)
+    return raw.map_features(Normalizer.fit(raw.features))
+
+
+@pytest.fixture(params=RESPONSE_MODELS, ids=str)
+def belief(request: pytest.FixtureRequest) -> Belief:
+    return Belief(request.param)

@@ -1,0 +1,198 @@
+import math
+
+import pytest
+import torch
+from conftest import RESPONSE_MODELS
+from torch import Generator, Tensor
+
+from torchrl_pref.belief import (
+    Belief,
+    feature_gaps,
+    kish_share,
+    systematic_resample,
+    uniform_sphere,
+)
+from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel
+from torchrl_pref.sampler import bracket
+
+
+def grid_of_sphere(n_features: int) -> tuple[Tensor, Tensor]:
+    """Points (G D) and weights (G) of a quadrature of the circle or of the sphere, in float64."""
+    if n_features == 2:
+        angle = torch.arange(20000, dtype=torch.float64) * (2 * math.pi / 20000)
+        return torch.stack([angle.cos(), angle.sin()], -1), torch.ones_like(angle)
+    # Equal areas: the height is uniform, by the theorem of Archimedes.
+    height = (torch.arange(600, dtype=torch.float64) + 0.5) / 300 - 1
+    turn = torch.arange(600, dtype=torch.float64) * (2 * math.pi / 600)
+    height, turn = torch.meshgrid(height, turn, indexing="ij")
+    radius = (1 - height.square()).sqrt()
+    points = torch.stack([radius * turn.cos(), radius * turn.sin(), height], -1).flatten(0, 1)
+    return points, torch.ones(len(points), dtype=torch.float64)
+
+
+def exact_moments(model: ResponseModel, queries: Tensor, answers: Tensor) -> tuple[Tensor, Tensor]:
+    """Posterior mean (D) and covariance (D D) by brute force over all answers at once."""
+    points, weights = grid_of_sphere(queries.shape[-1])
+    log_probs = model(torch.einsum("gd,hkd->ghk", points, queries.double()))
+    picked = log_probs.gather(-1, answers.expand(len(points), -1).unsqueeze(-1)).squeeze(-1)
+    weights = weights * (picked.sum(-1)).exp()
+    weights = weights / weights.sum()
+    mean = weights @ points
+    return mean, (points * weights.unsqueeze(1)).T @ points - torch.outer(mean, mean)
+
+
+def converse(
+    belief: Belief, queries: Tensor, answers: Tensor, sessions: int, generator: Generator
+) -> tuple[Tensor, Tensor]:
+    """Tell the same answers (H) to queries (H K D) to many sessions; samples and effective sizes."""
+    samples = belief.prior(sessions, queries.shape[-1], generator)
+    ess = torch.full((sessions,), float(belief.n_samples))
+    gaps = feature_gaps(queries, answers)
+    for h in range(len(queries)):
+        earlier = gaps[:h].expand(sessions, *gaps[:h].shape)
+        newest = gaps[h].expand(sessions, *gaps[h].shape)
+        update = belief.update(samples, ess, earlier, newest, generator)
+        assert update.used.all()
+        samples, ess = update.samples, update.ess
+    return samples, ess
+
+
+@pytest.mark.parametrize("n_options", [2, 3])
+@pytest.mark.parametrize("n_features", [2, 3])
+@pytest.mark.parametrize("model", RESPONSE_MODELS, ids=str)
+def test_moments_agree_with_quadrature(
+    model: ResponseModel, n_features: int, n_options: int, generator: Generator
+) -> None:
+    queries = torch.randn(6, n_options, n_features, generator=generator)
+    omega = uniform_sphere((n_features,), generator)
+    answers = model(queries @ omega).exp().multinomial(1, generator=generator).squeeze(-1)
+    mean, covariance = exact_moments(model, queries, answers)
+    sessions = 400
+    samples, _ = converse(Belief(model), queries, answers, sessions, generator)
+
+    per_session = samples.double().mean(1)
+    error = per_session.std(0) / math.sqrt(sessions)
+    assert ((per_session.mean(0) - mean).abs() < 5 * error).all()
+
+    # Second moments about the exact mean, so that nothing is lost to the mean's own estimate.
+    centred = samples.double() - mean
+    moments = torch.einsum("smd,sme->sde", centred, centred) / samples.shape[1]
+    error = moments.std(0) / math.sqrt(sessions)
+    assert ((moments.mean(0) - covariance).abs() < 5 * error + 1e-12).all()
+
+
+@pytest.mark.parametrize("model", RESPONSE_MODELS, ids=str)
+def test_effective_sample_size_is_what_it_says(model: ResponseModel, generator: Generator) -> None:
+    """Var(ω) / ESS is the variance of the mean over independent runs of the same answers."""
+    queries = torch.randn(10, 2, 4, generator=generator)
+    omega = uniform_sphere((4,), generator)
+    answers = (queries @ omega).argmax(-1)
+    samples, ess = converse(Belief(model, moves=2), queries, answers, 400, generator)
+    true = samples.flatten(0, 1).var(0).sum() / samples.mean(1).var(0).sum()
+    assert ess.mean() == pytest.approx(float(true), rel=0.35)
+    assert ((ess >= 1) & (ess <= 100)).all()
+
+
+@pytest.mark.parametrize("model", RESPONSE_MODELS, ids=str)
+def test_calibration(model: ResponseModel, generator: Generator) -> None:
+    """Simulation-based calibration (Talts et al., 2018): the rank of the truth is uniform."""
+    sessions, budget, n_features = 2000, 8, 4
+    belief = Belief(model, samples=99, moves=8)
+    omega = uniform_sphere((sessions, n_features), generator)
+    samples = belief.prior(sessions, n_features, generator)
+    ess = torch.full((sessions,), 99.0)
+    gaps = torch.zeros(sessions, 0, 1, n_features)
+    for _ in range(budget):
+        queries = torch.randn(sessions, 2, n_features, generator=generator)
+        log_probs = model((queries @ omega.unsqueeze(-1)).squeeze(-1))
+        answers = log_probs.exp().multinomial(1, generator=generator).squeeze(-1)
+        newest = feature_gaps(queries, answers)
+        samples, ess, _ = belief.update(samples, ess, gaps, newest, generator)
+        gaps = torch.cat([gaps, newest.unsqueeze(1)], 1)
+        # Hard answers never exclude the human who gave them.
+        returns = (gaps @ omega[:, None, :, None]).squeeze(-1)
+        assert model.log_likelihood(returns).sum(-1).isfinite().all()
+    assert samples.isfinite().all()
+    for feature in range(n_features):
+        ranks = (samples[..., feature] < omega[:, None, feature]).sum(1)
+        counts = torch.histc(ranks.float(), 10, 0, 99)
+        chi_square = ((counts - sessions / 10).square() / (sessions / 10)).sum()
+        # 9 degrees of freedom: 33.7 is exceeded once in 10,000. The samples of a session are not
+        # independent, which widens it a little.
+        assert chi_square < 33.7
+
+
+def test_contradicting_hard_answer_is_left_out(generator: Generator) -> None:
+    """Three half-planes whose normals are 120° apart have only the origin in common."""
+    turns = torch.arange(3) * (2 * math.pi / 3)
+    normals = torch.stack([turns.cos(), turns.sin()], -1)
+    gaps = normals.view(3, 1, 1, 2).expand(3, 5, 1, 2)
+    belief = Belief(Optimal())
+    samples, ess = belief.prior(5, 2, generator), torch.full((5,), 100.0)
+    before, ess, used = belief.update(samples, ess, gaps[:0].transpose(0, 1), gaps[0], generator)
+    assert used.all()
+    before, ess, used = belief.update(before, ess, gaps[:1].transpose(0, 1), gaps[1], generator)
+    assert used.all()
+    assert (before @ normals[:2].T >= -1e-5).all()
+    after = belief.update(before, ess, gaps[:2].transpose(0, 1), gaps[2], generator)
+    assert not after.used.any()
+    assert torch.equal(after.samples, before)
+    assert torch.equal(after.ess, ess)
+
+
+@pytest.mark.parametrize("model", [*RESPONSE_MODELS, Boltzmann(1e4)], ids=str)
+def test_surprising_answers_leave_neither_copies_nor_nan(
+    model: ResponseModel, generator: Generator
+) -> None:
+    """The second answer has a prior probability of about 1 in 500: few or none of 100 agree."""
+    angle = math.pi / 250
+    normals = torch.tensor([[0.0, 1.0], [math.sin(angle), -math.cos(angle)]])
+    queries = torch.stack([normals, torch.zeros(2, 2)], 1) * 3
+    samples, ess = converse(Belief(model), queries, torch.tensor([0, 0]), 50, generator)
+    assert samples.isfinite().all()
+    assert all(len(session.unique(dim=0)) > 50 for session in samples)
+    if not isinstance(model, Boltzmann):
+        assert (samples @ normals.T >= -1e-5).all()
+        assert (ess > 20).all()
+
+
+def test_identical_options_teach_nothing(belief: Belief, generator: Generator) -> None:
+    queries = torch.ones(3, 2, 4)
+    samples, ess = converse(belief, queries, torch.tensor([0, 1, 0]), 300, generator)
+    assert samples.mean((0, 1)).norm() < 5 / math.sqrt(300 * 100)
+    assert (ess > 90).all()
+
+
+def test_bracket_ends_at_the_nearest_crossings(generator: Generator) -> None:
+    chains, answers = 300, 5
+    cosine, sine, depth = torch.randn(3, chains, answers, 1, generator=generator).unbind()
+    least = cosine - depth.abs()
+    low, high = bracket(cosine, sine, least, torch.rand(chains, generator=generator))
+    angles = torch.linspace(-2 * math.pi, 2 * math.pi, 20001)
+    for c in range(chains):
+        inside = (cosine[c] * angles.cos() + sine[c] * angles.sin() >= least[c] - 1e-6).all(0)
+        if inside.all():
+            assert float(high[c] - low[c]) == pytest.approx(2 * math.pi, abs=1e-4)
+            continue
+        first_above = angles[10000:][~inside[10000:]][0]
+        first_below = angles[:10001][~inside[:10001]][-1]
+        assert float(high[c]) == pytest.approx(float(first_above), abs=2e-3)
+        assert float(low[c]) == pytest.approx(float(first_below), abs=2e-3)
+
+
+def test_permuting_options_permutes_the_answer(generator: Generator) -> None:
+    queries = torch.randn(20, 4, 3, generator=generator)
+    answers = torch.randint(4, (20,), generator=generator)
+    order = torch.randperm(4, generator=generator)
+    renamed = (order == answers.unsqueeze(1)).long().argmax(1)
+    gaps, other = feature_gaps(queries, answers), feature_gaps(queries[:, order], renamed)
+    assert torch.allclose(gaps.sort(1).values, other.sort(1).values)
+    assert (feature_gaps(queries, torch.full((20,), -1)) == 0).all()
+
+
+def test_resampling_follows_the_weights(generator: Generator) -> None:
+    log_weights = torch.tensor([[0.0, math.log(2), -math.inf, 0.0]]).expand(2000, 4)
+    counts = systematic_resample(log_weights, generator).flatten().bincount(minlength=4) / 2000
+    assert counts.tolist() == pytest.approx([1, 2, 0, 1], abs=0.05)
+    assert float(kish_share(log_weights[0])) == pytest.approx(16 / (4 * 6))
+    assert float(kish_share(torch.full((4,), -math.inf))) == 0

@@ -22,8 +22,8 @@ from torchrl_pref.errors import check_count
 from torchrl_pref.responses import ResponseModel
 from torchrl_pref.sampler import great_circle_step
 
-MAX_STAGES = 30
-"""An answer that fewer than 1 in 4³⁰ of the belief agree with contradicts the earlier answers."""
+MAX_STAGES = 12
+"""An answer that fewer than 1 in 4¹² of the belief agree with contradicts the earlier answers."""
 
 MIN_SHARE = 0.25
 """Kish effective share of the samples that a reweighting must keep; below it a stage is added."""

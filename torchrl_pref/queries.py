@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import pickle
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -132,7 +131,7 @@ def load_safely(path: str | Path, kind: str) -> dict[str, Any]:
         raise InputError(f"{path}: no such file; expected a {kind}; check the path")
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except (RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError) as error:
+    except Exception as error:  # whatever the reader trips over, the file is at fault
         raise InputError(
             f"{path}: cannot be read as a {kind} (cut off, or not a file of plain tensors); "
             "expected a file written by this package; make it again or restore a copy"

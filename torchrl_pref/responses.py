@@ -89,8 +89,8 @@ class Boltzmann(ResponseModel):
         return -torch.logsumexp(F.pad(-self.tau * gaps, (1, 0)), -1)
 
     def least_gap(self, log_likelihood: Tensor) -> Tensor:
-        """See :meth:`ResponseModel.least_gap`; the option beats each other one at least so often."""
-        # The inverse of log σ(τ g); for very unlikely answers exp(-ℓ) - 1 is exp(-ℓ).
+        """See :meth:`ResponseModel.least_gap`."""
+        # No option is chosen more often than it beats any one other, whose log is log σ(τ g).
         surprise = -log_likelihood
         return -(surprise + torch.log(-torch.expm1(-surprise))) / self.tau
 

@@ -3,8 +3,8 @@
 Shapes: S sessions, M samples, C = S·M chains, H answers, K options per query, D features.
 
 A slice sampler (Neal, 2003) restricted to a great circle through the current point (Habeck,
-Hasenpflug, Kodgirwar and Rudolf, *Geodesic slice sampling on the sphere*, 2023). It has no step size
-to tune and works for hard answers, whose likelihood is zero on one side.
+Hasenpflug, Kodgirwar and Rudolf, *Geodesic slice sampling on the sphere*, 2023). It has no step
+size to tune and works for hard answers, whose likelihood is zero on one side.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def great_circle_step(
 
     angle = torch.zeros_like(pole_angle)
     uniform = torch.rand((2, len(angle)), generator=generator, device=angle.device)
-    circle = (cosine, sine, raised, pole_angle)
+    circle: tuple[Tensor, ...] = (cosine, sine, raised, pole_angle)
     threshold = log_density(angle, circle) + uniform[0].log()
     # Every factor of the density is at most one, so no single answer falls below the threshold.
     least = response_model.least_gap(threshold)[:, None, None].repeat(1, *shape[1:])

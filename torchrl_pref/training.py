@@ -140,6 +140,7 @@ class Trainer:
             frames_per_batch=settings.sessions * settings.steps,
             total_frames=-1,
             track_traj_ids=False,
+            auto_register_policy_transforms=False,
         )
 
     def run(self, folder: Path, save: Callable[[], None]) -> bool:

@@ -1,0 +1,19 @@
+"""Ask about your own trajectories: all you need is a feature tensor (N queries, K options, D)."""
+
+import torch
+
+from torchrl_pref import Belief, Boltzmann, Normalizer, QueryEnv, QueryPool, SimulatedHuman
+from torchrl_pref.strategies import Greedy, RandomQuery
+
+# Say, 300 pairs of grasps described by speed, force and clearance.
+features = torch.rand(300, 2, 3, generator=torch.Generator().manual_seed(0))
+pool = QueryPool(features)
+pool = pool.map_features(Normalizer.fit(pool.features))
+
+model = Boltzmann(tau=3.0)
+env = QueryEnv(pool, SimulatedHuman(model), Belief(model), budget=10, batch_size=(50,))
+for name, strategy in {"random": RandomQuery(), "greedy": Greedy(model)}.items():
+    env.set_seed(0)
+    session = env.rollout(10, strategy)
+    alignment = session["next", "metrics", "alignment"][:, -1].mean()
+    print(f"{name}: alignment {alignment:.2f} after 10 answers of each of 50 humans")

@@ -1,0 +1,186 @@
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from torchrl_pref.checkpoint import Checkpoint
+from torchrl_pref.errors import InputError
+from torchrl_pref.experiment import (
+    load_weights,
+    make_checkpoint,
+    make_pools,
+    make_task,
+    make_trainer,
+    reload_task,
+)
+from torchrl_pref.queries import QueryPool, gridworld_pool
+from torchrl_pref.training import Trainer
+
+
+def settings_of(setup: str = "feed", policy: str = "scorer", **training: Any) -> dict[str, Any]:
+    return {
+        "tau": "noisy",
+        "seed": 0,
+        "device": "cpu",
+        "grid": {"size": 8, "length": 20},
+        "pool": {"size": 30, "options": 2, "seed": 0, "train": None, "test": None},
+        "belief": {"samples": 10, "moves": 1},
+        "evaluation": {"humans": 5, "seed": 1},
+        "policy": {"name": policy, "sample": False},
+        "setup": {
+            "name": setup,
+            "budget": 4,
+            "offers": None,
+            "on_skip": "new",
+            "candidates": 8,
+            "repeats": True,
+        },
+        "training": {
+            "updates": 6,
+            "sessions": 4,
+            # Not a divisor of the episode, so that batches end in mid-session.
+            "steps": 3,
+            "optimizer": "rmsprop",
+            "learning_rate": 0.01,
+            "gamma": 0.99,
+            "lmbda": 0.95,
+            "entropy": 0.01,
+            "critic": 0.5,
+            "grad_norm": 0.5,
+            "save_every": 2,
+            **training,
+        },
+    }
+
+
+def trainer_of(settings: dict[str, Any]) -> tuple[Trainer, Any]:
+    task = make_task(*make_pools(settings), settings["tau"])
+    return make_trainer(settings, task), task
+
+
+def same(first: Any, second: Any) -> bool:
+    """Whether two nests of plain data and tensors are equal to the last bit; NaN equals NaN."""
+    if isinstance(first, dict):
+        return first.keys() == second.keys() and all(same(first[k], second[k]) for k in first)
+    if isinstance(first, (list, tuple)):
+        return len(first) == len(second) and all(map(same, first, second))
+    if isinstance(first, torch.Tensor):
+        return torch.equal(first.nan_to_num(7.5), second.nan_to_num(7.5))
+    return bool(first == second) or (first != first and second != second)
+
+
+@pytest.mark.parametrize("setup", ["query", "feed"])
+@pytest.mark.parametrize("policy", ["scorer", "paper"])
+def test_resumed_run_equals_an_uninterrupted_one_bit_for_bit(
+    setup: str, policy: str, tmp_path: Path
+) -> None:
+    results = []
+    for stops in ([], [2, 5]):
+        settings = settings_of(setup, policy)
+        path = tmp_path / f"{len(stops)}.pt"
+        for updates in [*stops, 6]:
+            settings["training"]["updates"] = updates
+            trainer, task = trainer_of(settings)
+            if path.exists():
+                checkpoint = Checkpoint.load(path)
+                load_weights(trainer.policy, checkpoint)
+                torch.rand(7)  # whatever else used the global generator
+                trainer.load_state_dict(checkpoint.training)
+            finished = trainer.run(
+                tmp_path / f"run{len(stops)}",
+                lambda s=settings, k=task, t=trainer, p=path: make_checkpoint(s, k, t).save(p),
+            )
+            assert finished
+        results.append(Checkpoint.load(path))
+    whole, resumed = results
+    assert same(whole.weights, resumed.weights)
+    for name in ("update", "optimizer", "sessions", "env_generator", "global_generator"):
+        assert same(whole.training[name], resumed.training[name]), name
+    for name, values in whole.history.items():
+        if name.startswith("train/"):
+            assert same(values, resumed.history[name])
+    csv = [sorted((tmp_path / f"run{n}" / "csv").rglob("alignment.csv"))[0] for n in (0, 2)]
+    assert csv[0].read_text() == csv[1].read_text()
+
+
+def test_a2c_learns_what_the_feed_rewards(tmp_path: Path) -> None:
+    """With the paper's ±r reward, asking pays: the episodes get shorter (the paper's Figure 2)."""
+    settings = settings_of(updates=40, sessions=32, steps=8, optimizer="adam", learning_rate=0.01)
+    trainer, _ = trainer_of(settings)
+    trainer.run(tmp_path, lambda: None)
+    lengths = trainer.progress.history["train/episode_length"]
+    assert sum(lengths[-5:]) / 5 < sum(lengths[1:6]) / 5 - 1
+    assert sum(trainer.progress.history["train/reward"][-5:]) > 0
+
+
+def test_ctrl_c_stops_after_the_update_and_saves(tmp_path: Path) -> None:
+    trainer, _ = trainer_of(settings_of(updates=1000, save_every=1000))
+    before = signal.getsignal(signal.SIGINT)
+    learn, saved = trainer.update, []
+
+    def interrupt(batch: Any) -> None:
+        if trainer.progress.update == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+        learn(batch)
+
+    trainer.update = interrupt  # type: ignore[method-assign]
+    assert not trainer.run(tmp_path, lambda: saved.append(trainer.progress.update))
+    assert saved == [3]
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("updates", 0),
+        ("sessions", 2.5),
+        ("learning_rate", -1),
+        ("gamma", 1.5),
+        ("optimizer", "sgd"),
+    ],
+)
+def test_bad_constants_are_refused(key: str, value: object) -> None:
+    with pytest.raises(InputError, match=f"training.{key}="):
+        trainer_of(settings_of(**{key: value}))
+
+
+def test_checkpoint_says_what_does_not_fit(tmp_path: Path) -> None:
+    settings = settings_of("query", "paper")
+    trainer, task = trainer_of(settings)
+    make_checkpoint(settings, task, trainer).save(tmp_path / "checkpoint.pt")
+    checkpoint = Checkpoint.load(tmp_path)
+    checkpoint.check_fits(task.test)
+    with pytest.raises(InputError, match=r"N=31 \(trained on 30\), K=3 \(trained on 2\)"):
+        checkpoint.check_fits(gridworld_pool(31, 3))
+    with pytest.raises(InputError, match=r"D=5 \(trained on 4\)"):
+        checkpoint.check_fits(QueryPool(torch.rand(30, 2, 5)))
+    assert torch.equal(checkpoint.normalizer.std, task.normalizer.std)
+    other = trainer_of(settings_of("feed", "paper"))[0]
+    with pytest.raises(InputError, match="weights do not fit"):
+        load_weights(other.policy, checkpoint)
+
+    scorer, _ = trainer_of(settings_of("query"))
+    make_checkpoint(settings_of("query"), task, scorer).save(tmp_path / "checkpoint.pt")
+    Checkpoint.load(tmp_path).check_fits(gridworld_pool(31))
+
+    gridworld_pool(30, seed=9).save(tmp_path / "train_pool.pt")
+    gridworld_pool(30, seed=9).save(tmp_path / "test_pool.pt")
+    pools = tmp_path / "train_pool.pt", tmp_path / "test_pool.pt"
+    with pytest.raises(InputError, match="does not fit the train pool: digest"):
+        reload_task(checkpoint, *pools)
+
+
+def test_foreign_and_old_checkpoints_are_refused(tmp_path: Path) -> None:
+    gridworld_pool(30).save(tmp_path / "pool.pt")
+    with pytest.raises(InputError, match="holds query pool; expected a torchrl_pref checkpoint"):
+        Checkpoint.load(tmp_path / "pool.pt")
+    torch.save({"kind": "torchrl_pref checkpoint", "settings": {}}, tmp_path / "old.pt")
+    with pytest.raises(InputError, match="written by another version"):
+        Checkpoint.load(tmp_path / "old.pt")
+    with pytest.raises(InputError, match="no such file"):
+        Checkpoint.load(tmp_path)

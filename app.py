@@ -25,17 +25,17 @@ def main(job: Callable[[], Any]) -> None:
     with one_line_errors():
         try:
             job()
-        except OSError as error:
-            raise InputError(
-                f"{error.filename}: the run folder cannot be written ({error.strerror}); "
-                "set hydra.run.dir to a folder that can be"
-            ) from None
         except (HydraException, OmegaConfBaseException) as error:
             text = " ".join(str(error).split())
             text = re.sub(
                 r"\.? (Config search path:|full_key:|To append to your config).*", "", text
             )
             raise InputError(f"{text}; --help lists the keys and their values") from None
+        except OSError as error:
+            raise InputError(
+                f"{error.filename}: the run folder cannot be written ({error.strerror}); "
+                "set hydra.run.dir to a folder that can be"
+            ) from None
 
 
 def plain_settings(config: DictConfig) -> dict[str, Any]:

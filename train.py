@@ -50,6 +50,7 @@ def begin(folder: Path, settings: dict[str, Any], start: str | None) -> float:
     pools = experiment.make_pools(settings)
     task = experiment.make_task(*pools, settings["tau"])
     trainer = experiment.make_trainer(settings, task)
+    comparison.check_evaluation(settings)
     if start is not None:
         experiment.load_weights(trainer.policy, Checkpoint.load(start))
     for pool, name in zip(pools, POOLS, strict=True):

@@ -58,6 +58,17 @@ def evaluate_panels(
     }
 
 
+def check_evaluation(settings: Settings) -> tuple[int, int]:
+    """How many humans, and their seed; to be called before a training whose result they judge.
+
+    Raises:
+        InputError: they are too few, or the seed is negative.
+    """
+    section = settings["evaluation"]
+    n_humans = check_count("evaluation.humans", section["humans"], 2)
+    return n_humans, check_count("evaluation.seed", section["seed"], 0)
+
+
 def compare(
     settings: Settings, task: Task, pool: QueryPool, learned: Mapping[str, Checkpoint]
 ) -> dict[str, Evaluation]:
@@ -74,8 +85,7 @@ def compare(
     Returns:
         By name: ``random``, ``greedy``, for a feed also ``ask all``, and the learned ones.
     """
-    n_humans = check_count("evaluation.humans", settings["evaluation"]["humans"], 2)
-    seed = check_count("evaluation.seed", settings["evaluation"]["seed"], 0)
+    n_humans, seed = check_evaluation(settings)
     humans = draw_humans(make_query_env(settings, task, pool, n_humans, seed))
     runs: list[tuple[str, QueryEnv | FeedEnv, TensorDictModuleBase, bool]] = []
 

@@ -1,0 +1,276 @@
+"""The scripts as a user types them."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import re
+import runpy
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import DictConfig, OmegaConf
+
+from torchrl_pref.checkpoint import Checkpoint
+from torchrl_pref.queries import QueryPool, gridworld_pool
+
+ROOT = Path(__file__).parent.parent
+
+TINY_TASK = ["belief.samples=10", "belief.moves=1", "pool.size=40", "setup.budget=4"]
+TINY_TASK += ["evaluation.humans=6"]
+TINY = [*TINY_TASK, "training.updates=3", "training.sessions=4", "training.steps=3"]
+
+
+def start(script: str, *arguments: str, cwd: Path = ROOT) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, str(ROOT / script), *arguments],
+        cwd=cwd,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def run(script: str, *arguments: str, cwd: Path = ROOT) -> str:
+    process = start(script, *arguments, cwd=cwd)
+    output, errors = process.communicate(timeout=120)
+    assert process.returncode == 0, errors
+    return output
+
+
+def test_train_evaluate_and_resume(tmp_path: Path) -> None:
+    """Typed from another folder, with its default run folder."""
+    output = run("train.py", "setup=feed", "tau=noisy", *TINY, cwd=tmp_path)
+    folder = next((tmp_path / "outputs").glob("*/*"))
+    for name in ("checkpoint.pt", "train_pool.pt", "figure_1.png", "figure_2.png", "training.png"):
+        assert (folder / name).stat().st_size > 1000
+    assert (folder / "csv" / "scalars" / "train" / "alignment.csv").exists()
+    assert list((folder / "tensorboard").glob("events*"))
+    for row in ("random", "greedy information gain", "ask all (feed)", "RL-feed"):
+        assert re.search(rf"^{re.escape(row)} +-?\d\.\d+ +-?\d\.\d+ +-?\d\.\d+", output, re.M)
+    assert "noisy user (tau=" in output
+
+    output = run("evaluate.py", f"checkpoint={folder}", "evaluation.humans=7", cwd=tmp_path)
+    assert "RL-feed" in output
+    other = gridworld_pool(25, seed=77)
+    other.save(tmp_path / "other.pt")
+    output = run("evaluate.py", f"checkpoint={folder}", "pool.test=other.pt", cwd=tmp_path)
+    assert "RL-feed" in output
+
+    output = run("train.py", f"resume={folder}", "training.updates=5", cwd=tmp_path)
+    assert str(folder) in output
+    assert Checkpoint.load(folder).training["update"] == 5
+
+
+def test_resume_is_bit_for_bit(tmp_path: Path) -> None:
+    whole, parts = f"hydra.run.dir={tmp_path}/whole", f"hydra.run.dir={tmp_path}/parts"
+    run("train.py", "setup=query", *TINY, whole)
+    run("train.py", "setup=query", *TINY, "training.updates=1", parts)
+    run("train.py", f"resume={tmp_path}/parts", "training.updates=3")
+    first, second = (Checkpoint.load(tmp_path / name) for name in ("whole", "parts"))
+    for key, value in first.weights.items():
+        assert torch.equal(value, second.weights[key])
+    tables = [(tmp_path / name / "tables.txt").read_text() for name in ("whole", "parts")]
+    untimed = [re.sub(r"\S+$", "", table, flags=re.M) for table in tables]
+    assert untimed[0] == untimed[1]
+
+
+def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    long = ["training.updates=100000", "training.save_every=1"]
+    process = start("train.py", *TINY, *long, f"hydra.run.dir={folder}")
+    for _ in range(600):
+        if (folder / "checkpoint.pt").exists():
+            break
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert f"python train.py resume={folder}" in output
+    assert Checkpoint.load(folder).training["update"] > 0
+
+
+def test_sweep_makes_one_table(tmp_path: Path) -> None:
+    sweep = f"hydra.sweep.dir={tmp_path}/sweep"
+    output = run("train.py", "-m", "setup=query,feed", "tau=optimal,0.5", *TINY, sweep)
+    with (tmp_path / "sweep" / "summary.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["setup"], row["tau"]) for row in rows] == [
+        ("query", "optimal"),
+        ("query", "0.5"),
+        ("feed", "optimal"),
+        ("feed", "0.5"),
+    ]
+    assert all(-1 <= float(row["alignment after 4"]) <= 1 for row in rows)
+    assert "summary.csv" in output
+    output = run("evaluate.py", f"checkpoint={tmp_path}/sweep", f"hydra.run.dir={tmp_path}/all")
+    for row in ("optimal user", "noisy user (tau=0.5)", "RL ", "RL-feed"):
+        assert row in output
+    assert (tmp_path / "all" / "figure_2.png").exists()
+
+
+@pytest.mark.parametrize("setup", ["query", "feed"])
+def test_paper_experiment(setup: str, tmp_path: Path) -> None:
+    output = run(
+        "train.py",
+        "experiment=paper",
+        f"setup={setup}",
+        *TINY,
+        "pool.options=3",
+        "seed=3",
+        f"hydra.run.dir={tmp_path}",
+    )
+    checkpoint = Checkpoint.load(tmp_path)
+    assert checkpoint.settings["policy"]["name"] == "paper"
+    assert checkpoint.settings["training"]["optimizer"] == "rmsprop"
+    # An index of the training pool means nothing elsewhere: it is evaluated on both.
+    assert ("training pool" in output) == (setup == "query")
+
+
+def test_evaluate_compares_the_baselines(tmp_path: Path) -> None:
+    output = run("evaluate.py", *TINY_TASK, f"hydra.run.dir={tmp_path}")
+    for row in ("optimal user", "noisy user", "random", "greedy", "cosine of mean", "repeated"):
+        assert row in output
+    with (tmp_path / "curves.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {row["metric"] for row in rows} >= {"alignment", "alignment_of_mean", "information"}
+    assert len({row["panel"] for row in rows}) == 2
+
+
+@pytest.mark.parametrize("example", sorted((ROOT / "examples").glob("*.py")), ids=lambda p: p.stem)
+def test_examples_run(example: Path) -> None:
+    assert len(example.read_text().splitlines()) < 40
+    assert run(str(example.relative_to(ROOT)), "2")
+
+
+def keys_of(config: DictConfig) -> set[str]:
+    """Dotted keys of the leaves of a configuration."""
+    plain = OmegaConf.to_container(config)
+    found: set[str] = set()
+
+    def walk(node: object, prefix: str) -> None:
+        if isinstance(node, dict):
+            for key, value in node.items():
+                walk(value, f"{prefix}.{key}" if prefix else str(key))
+        else:
+            found.add(prefix)
+
+    walk(plain, "")
+    return found
+
+
+@pytest.mark.parametrize("script", ["train", "evaluate"])
+def test_help_explains_every_key(script: str) -> None:
+    help_text = run(f"{script}.py", "--help")
+    keys: set[str] = set()
+    for setup in ("query", "feed"):
+        with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+            keys |= keys_of(compose(script, [f"setup={setup}"]))
+    named = {"setup.name": "setup", "policy.name": "policy", "policy.sample": "policy"}
+    if script == "evaluate":  # only for training
+        keys -= {"seed", "setup.candidates", "setup.repeats", "setup.on_skip"}
+    for key in keys:
+        assert re.search(rf"\b{re.escape(named.get(key, key))}\b", help_text), key
+
+
+BAD_INPUT = [
+    ("train", "setup=nonsense", "Could not find 'setup/nonsense'"),
+    ("train", "policy=nonsense", "Could not find 'policy/nonsense'"),
+    ("train", "nonsense=1", "Could not override 'nonsense'"),
+    ("train", "belief.nonsense=1", "Could not override 'belief.nonsense'"),
+    ("train", "tau=-1", "tau=-1: expected a finite number above 0"),
+    ("train", "tau=0", "tau=0: expected a finite number above 0"),
+    ("train", "tau=nan", "tau=nan: expected a finite number above 0"),
+    ("train", "tau=loud", "tau='loud': expected noisy, optimal or a number above 0"),
+    ("train", "tau=[1,2]", "tau=[1, 2]: expected a finite number above 0"),
+    ("train", "belief.samples=1", "belief.samples=1: expected a whole number of at least 2"),
+    ("train", "belief.samples=many", "belief.samples='many': expected a whole number"),
+    ("train", "pool.options=1", "pool.options=1: expected a whole number of at least 2"),
+    ("train", "pool.size=0", "pool.size=0: expected a whole number of at least 1"),
+    ("train", "setup.budget=0", "setup.budget=0: expected a whole number of at least 1"),
+    ("train", "setup.offers=3", "setup.offers=3: expected a whole number of at least"),
+    ("train", "setup.on_skip=stay", "setup.on_skip='stay': expected one of new, repeat"),
+    ("train", "training.updates=0", "training.updates=0: expected a whole number"),
+    ("train", "evaluation.humans=1", "evaluation.humans=1: expected a whole number"),
+    ("train", "threads=0", "threads=0: expected a whole number"),
+    ("train", "seed=-1", "seed=-1: expected a whole number"),
+    ("train", "device=abacus", "device='abacus': expected cpu, cuda"),
+    ("train", "device=cuda:99", "device=cuda:99: this machine has"),
+    ("train", "resume=nowhere", "nowhere: no such file"),
+    ("train", "checkpoint=nowhere", "nowhere: no such file"),
+    ("train", "checkpoint={tmp}/text.pt", "cannot be read as a torchrl_pref checkpoint"),
+    ("train", "pool.train={tmp}/none.pt", "none.pt: no such file"),
+    ("train", "pool.train={tmp}/constant.pt", "feature 2 never varies"),
+    ("train", "pool.test={tmp}/three.pt", "pool.test has K=3"),
+    ("train", "pool.test={tmp}/wide.pt", "D=5: expected D=4"),
+    ("train", "hydra.run.dir={tmp}/text.pt/run", "the run folder cannot be written"),
+    ("evaluate", "checkpoint=nowhere", "checkpoint=nowhere: no checkpoint.pt there"),
+    ("evaluate", "checkpoint={tmp}/text.pt", "cannot be read as a torchrl_pref checkpoint"),
+    ("evaluate", "tau=loud", "tau='loud'"),
+    ("evaluate", "setup.budget=0", "setup.budget=0: expected a whole number of at least 1"),
+    ("evaluate", "evaluation.seed=x", "evaluation.seed='x': expected a whole number"),
+]
+
+
+@pytest.mark.parametrize(("script", "typed", "message"), BAD_INPUT, ids=lambda value: str(value))
+def test_bad_input_gets_one_line_status_2_and_no_files(
+    script: str,
+    typed: str,
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "text.pt").write_text("not a checkpoint")
+    constant = torch.rand(9, 2, 4)
+    constant[..., 2] = 3
+    QueryPool(constant).save(tmp_path / "constant.pt")
+    QueryPool(torch.rand(9, 3, 4)).save(tmp_path / "three.pt")
+    QueryPool(torch.rand(9, 2, 5)).save(tmp_path / "wide.pt")
+    before = sorted(tmp_path.rglob("*"))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", [f"{script}.py", typed.format(tmp=tmp_path)])
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")  # set by app.main; put back afterwards
+    threads = torch.get_num_threads()
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(ROOT / f"{script}.py"), run_name="__main__")
+    GlobalHydra.instance().clear()
+    torch.set_num_threads(threads)
+    printed = capsys.readouterr()
+    assert ended.value.code == 2
+    assert printed.err.startswith("error: ")
+    assert printed.err.count("\n") == 1
+    assert message in printed.err
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_settings_that_a_checkpoint_brings_cannot_be_typed(tmp_path: Path) -> None:
+    run("train.py", *TINY, f"hydra.run.dir={tmp_path}")
+    for script, typed in (("evaluate.py", "checkpoint"), ("train.py", "resume")):
+        process = start(script, f"{typed}={tmp_path}", "belief.samples=50")
+        _, errors = process.communicate(timeout=60)
+        assert process.returncode == 2
+        assert errors.startswith("error: belief.samples=50: ")
+        assert "remove belief.samples" in errors
+    content = (tmp_path / "checkpoint.pt").read_bytes()
+    (tmp_path / "checkpoint.pt").write_bytes(content[: len(content) // 2])
+    process = start("train.py", f"resume={tmp_path}")
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert "cut off" in errors
+    assert errors.count("\n") == 1
+
+
+def test_summary_is_plain_json(tmp_path: Path) -> None:
+    run("train.py", *TINY, f"hydra.run.dir={tmp_path}")
+    content = json.loads((tmp_path / "summary.json").read_text())
+    assert set(TINY) <= set(content["overrides"])
+    assert os.listdir(tmp_path / "csv" / "scalars" / "time") == ["frames_per_second.csv"]

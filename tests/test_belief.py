@@ -84,12 +84,13 @@ def test_moments_agree_with_quadrature(
 @pytest.mark.parametrize("model", RESPONSE_MODELS, ids=str)
 def test_effective_sample_size_is_what_it_says(model: ResponseModel, generator: Generator) -> None:
     """Var(ω) / ESS is the variance of the mean over independent runs of the same answers."""
-    queries = torch.randn(10, 2, 4, generator=generator)
+    queries = torch.randn(3, 2, 4, generator=generator)
     omega = uniform_sphere((4,), generator)
     answers = (queries @ omega).argmax(-1)
-    samples, ess = converse(Belief(model, moves=2), queries, answers, 400, generator)
+    samples, ess = converse(Belief(model, moves=1), queries, answers, 400, generator)
     true = samples.flatten(0, 1).var(0).sum() / samples.mean(1).var(0).sum()
-    assert ess.mean() == pytest.approx(float(true), rel=0.35)
+    assert float(true) < 70  # one move leaves copies close together: there is something to report
+    assert float(ess.mean()) == pytest.approx(float(true), rel=0.25)
     assert ((ess >= 1) & (ess <= 100)).all()
 
 

@@ -111,17 +111,21 @@ def write_curves(panels: Mapping[str, Results], path: Path) -> None:
 
 def figure_1(panels: Mapping[str, Results], path: Path) -> None:
     """The paper's Figure 1: alignment against the number of queries, one panel a kind of human."""
-    figure, axes = plt.subplots(
-        1, len(panels), figsize=(1 + 4.6 * len(panels), 4), sharey=True, squeeze=False
-    )
-    for axis, (title, results) in zip(axes[0], panels.items(), strict=True):
+    columns = min(2, len(panels))
+    rows = math.ceil(len(panels) / columns)
+    size = (1 + 4.6 * columns, 4 * rows)
+    figure, axes = plt.subplots(rows, columns, figsize=size, sharey=True, squeeze=False)
+    for axis in axes.flat[len(panels) :]:
+        axis.set_visible(False)
+    for axis, (title, results) in zip(axes.flat, panels.items(), strict=False):
         for name, result in results.items():
             _draw_curve(axis, name, result.alignment)
         axis.set(title=title, xlabel="queries asked", xlim=(0, None), ylim=(None, 1))
         axis.xaxis.get_major_locator().set_params(integer=True)
         axis.grid(alpha=0.25)
-    axes[0][0].set_ylabel("alignment (mean of cosines)")
-    axes[0][-1].legend(frameon=False, loc="lower right")
+        axis.legend(frameon=False, loc="lower right")
+    for row in axes:
+        row[0].set_ylabel("alignment (mean of cosines)")
     _save(figure, path)
 
 
@@ -155,7 +159,7 @@ def training_figure(history: Mapping[str, Sequence[float]], path: Path) -> None:
     for axis, name in zip(axes, names, strict=True):
         axis.plot(*smoothed(history[name]), color=STYLE["RL"][0])
         label = name.removeprefix("train/").replace("_", " ")
-        axis.set(xlabel="A2C updates", ylabel=f"{label} at the end of an episode")
+        axis.set(xlabel="A2C updates", ylabel=label, title=f"{label}, mean over ended episodes")
         axis.grid(alpha=0.25)
     _save(figure, path)
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import copy
 import os
 import signal
 from pathlib import Path
@@ -184,3 +185,16 @@ def test_foreign_and_old_checkpoints_are_refused(tmp_path: Path) -> None:
         Checkpoint.load(tmp_path / "old.pt")
     with pytest.raises(InputError, match="no such file"):
         Checkpoint.load(tmp_path)
+
+
+def test_rows_after_the_last_checkpoint_are_written_once(tmp_path: Path) -> None:
+    """A run that was killed has logged more than it saved."""
+    settings = settings_of(updates=5, save_every=2)
+    trainer, _ = trainer_of(settings)
+    states: list[dict[str, Any]] = []
+    trainer.run(tmp_path, lambda: states.append(copy.deepcopy(trainer.state_dict())))
+    again, _ = trainer_of(settings)
+    again.load_state_dict(states[0])
+    again.run(tmp_path, lambda: None)
+    rows = (tmp_path / "csv" / "scalars" / "time" / "frames_per_second.csv").read_text()
+    assert [int(row.split(",")[0]) for row in rows.splitlines()] == [1, 2, 3, 4, 5]

@@ -4,10 +4,13 @@ import scipy.stats
 import torch
 from conftest import RESPONSE_MODELS
 from test_envs import make
+from test_training import settings_of, trainer_of
 from torch import Generator
 
+from torchrl_pref.comparison import check_evaluation
 from torchrl_pref.envs import FeedEnv, QueryEnv
 from torchrl_pref.evaluation import CURVES, bootstrap_interval, draw_humans, evaluate
+from torchrl_pref.experiment import make_query_env
 from torchrl_pref.queries import QueryPool
 from torchrl_pref.strategies import Greedy, RandomAsk, RandomQuery
 
@@ -75,3 +78,13 @@ def test_bootstrap_agrees_with_scipy(generator: Generator) -> None:
     ).confidence_interval
     assert bootstrap_interval(values) == pytest.approx(tuple(expected), abs=0.03)
     assert bootstrap_interval(torch.full((9,), 2.0)) == (2.0, 2.0)
+
+
+def test_humans_of_the_evaluation_are_not_those_of_the_training() -> None:
+    settings = settings_of()
+    settings["evaluation"] = {"humans": settings["training"]["sessions"], "seed": settings["seed"]}
+    trainer, task = trainer_of(settings)
+    n_humans, seed = check_evaluation(settings)
+    judged = draw_humans(make_query_env(settings, task, task.test, n_humans, seed))
+    trained = trainer.collector._carrier
+    assert not torch.isclose(judged["human", "omega"], trained["human", "omega"]).any()

@@ -24,6 +24,9 @@ from torchrl_pref.policies import Policy
 from torchrl_pref.queries import QueryPool
 from torchrl_pref.strategies import Greedy, RandomAsk, RandomQuery
 
+FIRST_EVALUATION_SEED = 2**31
+"""Evaluation seeds lie where no training seed does: the humans of the one are not the other's."""
+
 Panels = dict[str, dict[str, Evaluation]]
 
 
@@ -59,14 +62,15 @@ def evaluate_panels(
 
 
 def check_evaluation(settings: Settings) -> tuple[int, int]:
-    """How many humans, and their seed; to be called before a training whose result they judge.
+    """How many humans, and their seed; call it before a training whose result they will judge.
 
     Raises:
         InputError: they are too few, or the seed is negative.
     """
     section = settings["evaluation"]
     n_humans = check_count("evaluation.humans", section["humans"], 2)
-    return n_humans, check_count("evaluation.seed", section["seed"], 0)
+    seed = check_count("evaluation.seed", section["seed"], 0)
+    return n_humans, FIRST_EVALUATION_SEED + seed
 
 
 def compare(

@@ -6,6 +6,7 @@ import csv
 import json
 import math
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import matplotlib
@@ -25,7 +26,7 @@ Results = Mapping[str, Evaluation]
 STYLE = {
     "random": ("#7f7f7f", "--"),
     "greedy": ("#1f1f1f", "-"),
-    "ask all": ("#a65628", ":"),
+    "ask all": ("#000000", ":"),
     "RL": ("#0072b2", "-"),
     "RL-feed": ("#d55e00", "-"),
 }
@@ -135,7 +136,9 @@ def _draw_curve(axis: Axes, name: str, values: Tensor) -> None:
     means = values.mean(0)
     intervals = torch.tensor([bootstrap_interval(column) for column in values.unbind(1)])
     queries = range(len(means))
-    (drawn,) = axis.plot(queries, means, line, color=color, label=NAMES.get(name, name))
+    # Dots go on top: a feed policy that asks everything lies exactly under "ask all".
+    label, order = NAMES.get(name, name), 3 if line == ":" else 2
+    (drawn,) = axis.plot(queries, means, line, color=color, label=label, zorder=order)
     axis.fill_between(
         queries, intervals[:, 0], intervals[:, 1], color=drawn.get_color(), alpha=0.15, lw=0
     )
@@ -145,8 +148,9 @@ def figure_2(histories: Mapping[str, Sequence[float]], path: Path) -> None:
     """The paper's Figure 2: mean length of the training episodes against the number of updates."""
     figure, axis = plt.subplots(figsize=(5.6, 4))
     for name, values in histories.items():
-        axis.plot(*smoothed(values), label=name)
-    axis.set(xlabel="A2C updates", ylabel="training episode length (offers)")
+        axis.plot(*smoothed(values, geometric_edges(len(values))), label=name)
+    # Most of it happens in the first hundredth of the updates.
+    axis.set(xlabel="A2C updates", ylabel="training episode length (offers)", xscale="log")
     axis.grid(alpha=0.25)
     axis.legend(frameon=False)
     _save(figure, path)
@@ -157,7 +161,7 @@ def training_figure(history: Mapping[str, Sequence[float]], path: Path) -> None:
     names = [name for name in history if name.startswith("train/")]
     figure, axes = plt.subplots(1, len(names), figsize=(4.2 * len(names), 3.4))
     for axis, name in zip(axes, names, strict=True):
-        axis.plot(*smoothed(history[name]), color=STYLE["RL"][0])
+        axis.plot(*smoothed(history[name], even_edges(len(history[name]))), color=STYLE["RL"][0])
         label = name.removeprefix("train/").replace("_", " ")
         axis.set(xlabel="A2C updates", ylabel=label, title=f"{label}, mean over ended episodes")
         axis.grid(alpha=0.25)
@@ -226,16 +230,28 @@ def sweep_table(folder: Path) -> str:
     return f"\nsweep so far, {folder / 'summary.csv'}\n" + tabulate(rows, headers="keys")
 
 
-def smoothed(values: Sequence[float], points: int = 100) -> tuple[list[float], list[float]]:
-    """Means of about ``points`` equal stretches, and the updates they are centred on."""
-    width = max(1, len(values) // points)
+def smoothed(values: Sequence[float], edges: Sequence[int]) -> tuple[list[float], list[float]]:
+    """Means of the known values between edges (1-based updates), and the updates' middles."""
     middles, means = [], []
-    for start in range(0, len(values), width):
-        known = [value for value in values[start : start + width] if not math.isnan(value)]
+    for start, end in pairwise(edges):
+        known = [value for value in values[start - 1 : end - 1] if not math.isnan(value)]
         if known:
-            middles.append(start + (min(width, len(values) - start) + 1) / 2)
+            middles.append((start + end - 1) / 2)
             means.append(sum(known) / len(known))
     return middles, means
+
+
+def even_edges(count: int) -> list[int]:
+    """Edges of at most 100 stretches of equal length that cover updates 1 to ``count``."""
+    return [*range(1, count + 1, math.ceil(count / 100)), count + 1]
+
+
+def geometric_edges(count: int) -> list[int]:
+    """Edges of stretches each about a tenth longer than the one before."""
+    edges = [1]
+    while edges[-1] <= count:
+        edges.append(min(count + 1, math.ceil(edges[-1] * 1.1 + 1e-9)))
+    return edges
 
 
 def _save(figure: Figure, path: Path) -> None:

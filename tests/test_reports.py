@@ -1,5 +1,6 @@
 import csv
 import math
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -26,7 +27,7 @@ def test_stretches_cover_every_update_once(edges_of: object, count: int) -> None
     edges = edges_of(count)  # type: ignore[operator]
     assert edges[0] == 1
     assert edges[-1] == count + 1
-    assert all(a < b for a, b in zip(edges, edges[1:], strict=False))
+    assert all(a < b for a, b in pairwise(edges))
     assert len(edges) <= 102
 
 

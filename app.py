@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from torchrl_pref.errors import InputError, check_count, one_line_errors
+
+SECTIONS = {"grid", "pool", "belief", "evaluation", "training", "setup", "policy"}
 
 
 def main(job: Callable[[], Any]) -> None:
@@ -31,6 +34,9 @@ def main(job: Callable[[], Any]) -> None:
                 r"\.? (Config search path:|full_key:|To append to your config).*", "", text
             )
             raise InputError(f"{text}; --help lists the keys and their values") from None
+        except KeyboardInterrupt:
+            print("\nstopped", file=sys.stderr)
+            raise SystemExit(130) from None
         except OSError as error:
             raise InputError(
                 f"{error.filename}: the run folder cannot be written ({error.strerror}); "
@@ -39,16 +45,42 @@ def main(job: Callable[[], Any]) -> None:
 
 
 def plain_settings(config: DictConfig) -> dict[str, Any]:
-    """The composed configuration as plain values, and torch set to its number of threads."""
+    """The composed configuration as plain values.
+
+    Raises:
+        InputError: a section was replaced by a value, or a group was renamed from within.
+    """
     settings = OmegaConf.to_container(config, resolve=True)
     assert isinstance(settings, dict)
-    torch.set_num_threads(check_count("threads", settings["threads"], 1))
+    for section in SECTIONS & set(settings):
+        if not isinstance(settings[section], dict):
+            raise InputError(
+                f"{section}={settings[section]!r}: {section} is a section of keys and not a value; "
+                f"type {section}.<key>=<value>, --help lists them"
+            )
+    for group in ("setup", "policy"):
+        chosen = HydraConfig.get().runtime.choices.get(group)
+        if chosen is not None and settings[group]["name"] != chosen:
+            name = settings[group]["name"]
+            raise InputError(
+                f"{group}.name={name!r}: type {group}={name} to choose another {group}"
+            )
     return {str(key): value for key, value in settings.items()}
+
+
+def use_threads(settings: dict[str, Any]) -> None:
+    """Set torch to the number of threads in the settings."""
+    torch.set_num_threads(check_count("threads", settings["threads"], 1))
 
 
 def typed_overrides() -> list[str]:
     """The keys=values that the user typed."""
     return list(HydraConfig.get().overrides.task)
+
+
+def was_typed(key: str) -> bool:
+    """Whether the user typed a value for a key."""
+    return any(override.split("=")[0].lstrip("+") == key for override in typed_overrides())
 
 
 def refuse_other_overrides(source: str, allowed: tuple[str, ...]) -> None:
@@ -76,6 +108,15 @@ def output_folder() -> Path:
 
 
 def discard_if_empty(folder: Path) -> None:
-    """Remove the folder of a job that left nothing in it, and parents that are empty then."""
-    with contextlib.suppress(OSError):
-        os.removedirs(folder)
+    """Remove a default folder that the job left empty, and the dated ones around it.
+
+    A folder that the user named is theirs, and stays.
+    """
+    try:
+        inside = folder.relative_to(Path.cwd())
+    except ValueError:
+        return
+    if inside.parts[0] in ("outputs", "multirun"):
+        with contextlib.suppress(OSError):
+            for path in (inside, *list(inside.parents)[:-1]):
+                path.rmdir()

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +26,15 @@ def job(config: DictConfig) -> None:
     try:
         with one_line_errors():
             settings = app.plain_settings(config)
+            app.use_threads(settings)
             named = settings["checkpoint"]
             if named is None:
                 reports.write_report(folder, evaluate_baselines(settings), {})
             else:
                 allowed = ("evaluation.", "pool.test", "device", "threads", "hydra.")
                 app.refuse_other_overrides("checkpoint", allowed)
-                paths = find_checkpoints(named if isinstance(named, list) else [named])
+                names = named if isinstance(named, list) else [named]
+                paths = find_checkpoints([str(name) for name in names])
                 reports.write_report(folder, *evaluate_checkpoints(settings, paths))
     finally:
         app.discard_if_empty(folder)
@@ -55,7 +58,7 @@ def find_checkpoints(named: list[str]) -> list[Path]:
     """
     paths = []
     for name in map(Path, named):
-        found = [name] if name.is_file() else sorted(name.rglob(FILE_NAME))
+        found = [name.resolve()] if name.is_file() else sorted(name.resolve().rglob(FILE_NAME))
         if not found:
             raise InputError(
                 f"checkpoint={name}: no {FILE_NAME} there; expected a checkpoint file, the folder "
@@ -70,23 +73,26 @@ def evaluate_checkpoints(
 ) -> tuple[comparison.Panels, dict[str, dict[str, list[float]]]]:
     """Learned policies beside random and greedy, a panel for each kind of human."""
     runs = []
+    common = Path(os.path.commonpath([path.parent.parent for path in paths]))
     for path in paths:
         checkpoint = Checkpoint.load(path)
         # The rest of the settings is the checkpoint's own.
         for section in ("evaluation", "device"):
             checkpoint.settings[section] = settings[section]
         pools = path.with_name("train_pool.pt"), path.with_name("test_pool.pt")
-        runs.append((path.parent.name, checkpoint, experiment.reload_task(checkpoint, *pools)))
+        name = str(path.parent.relative_to(common))
+        runs.append((name, checkpoint, experiment.reload_task(checkpoint, *pools)))
     panels: comparison.Panels = {}
     for panel_settings, task, learned in comparison.group_checkpoints(runs):
         test = None
         if settings["pool"]["test"] is not None:
             test = QueryPool.load(settings["pool"]["test"]).map_features(task.normalizer)
         panels |= comparison.evaluate_panels(panel_settings, task, learned, test)
-    histories = {
-        f"{comparison.label_of(checkpoint.settings)}, {task.title}, {name}": checkpoint.history
-        for name, checkpoint, task in runs
-    }
+    titles = [f"{comparison.label_of(c.settings)}, {task.title}" for _, c, task in runs]
+    histories = {}
+    for title, (name, checkpoint, _) in zip(titles, runs, strict=True):
+        unique = title if titles.count(title) == 1 else f"{title}, {name}"
+        histories[unique] = checkpoint.history
     return panels, histories
 
 

@@ -11,14 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 import app
 from torchrl_pref import comparison, experiment, reports
 from torchrl_pref.checkpoint import FILE_NAME, Checkpoint
-from torchrl_pref.errors import one_line_errors
+from torchrl_pref.errors import InputError, one_line_errors
 from torchrl_pref.training import Trainer
 
 POOLS = ("train_pool.pt", "test_pool.pt")
@@ -33,42 +31,55 @@ def job(config: DictConfig) -> float:
             settings = app.plain_settings(config)
             resume, start = settings.pop("resume"), settings.pop("checkpoint")
             if resume is not None:
-                app.refuse_other_overrides(
-                    "resume", ("training.updates", "device", "threads", "hydra.")
-                )
-                return go_on(Path(resume), settings)
-            alignment = begin(made, settings, start)
-            if HydraConfig.get().mode == RunMode.MULTIRUN:
-                print(reports.sweep_table(made.parent))
-            return alignment
+                allowed = ("training.updates", "device", "threads", "hydra.")
+                app.refuse_other_overrides("resume", allowed)
+                return go_on(Path(str(resume)), settings)
+            return begin(made, settings, None if start is None else str(start))
     finally:
         app.discard_if_empty(made)
 
 
 def begin(folder: Path, settings: dict[str, Any], start: str | None) -> float:
     """A new run in a folder."""
+    app.use_threads(settings)
+    settings["overrides"] = app.typed_overrides()
+    for name in (FILE_NAME, *POOLS):
+        if (folder / name).exists():
+            raise InputError(
+                f"{folder} holds a run already ({name}); go on with it by resume={folder}, or name "
+                "another folder by hydra.run.dir="
+            )
     pools = experiment.make_pools(settings)
     task = experiment.make_task(*pools, settings["tau"])
     trainer = experiment.make_trainer(settings, task)
     comparison.check_evaluation(settings)
     if start is not None:
-        experiment.load_weights(trainer.policy, Checkpoint.load(start))
+        checkpoint = Checkpoint.load(start)
+        checkpoint.check_fits(task.train, own_indices=True)
+        experiment.load_weights(trainer.policy, checkpoint)
     for pool, name in zip(pools, POOLS, strict=True):
         pool.save(folder / name)
+    OmegaConf.save(settings, folder / "config.yaml")
     return train(folder, settings, task, trainer)
 
 
 def go_on(folder: Path, typed: dict[str, Any]) -> float:
-    """An old run, from its last checkpoint."""
+    """An old run, from its last checkpoint, with its own settings."""
     checkpoint = Checkpoint.load(folder)
     settings = checkpoint.settings
-    settings["device"] = typed["device"]
-    if any(key.startswith("training.updates=") for key in app.typed_overrides()):
+    for key in ("device", "threads"):
+        if app.was_typed(key):
+            settings[key] = typed[key]
+    if app.was_typed("training.updates"):
         settings["training"]["updates"] = typed["training"]["updates"]
+    app.use_threads(settings)
     task = experiment.reload_task(checkpoint, *(folder / name for name in POOLS))
     trainer = experiment.make_trainer(settings, task)
     experiment.load_weights(trainer.policy, checkpoint)
     trainer.load_state_dict(checkpoint.training)
+    done, updates = trainer.progress.update, settings["training"]["updates"]
+    if done >= updates:
+        print(f"{done} updates are done; train further with training.updates={2 * done}")
     return train(folder, settings, task, trainer)
 
 
@@ -80,15 +91,22 @@ def train(folder: Path, settings: dict[str, Any], task: experiment.Task, trainer
     def save() -> None:
         experiment.make_checkpoint(settings, task, trainer).save(folder / FILE_NAME)
 
+    go_on_line = f"go on with: python train.py resume={shlex.quote(str(folder))}"
     if not trainer.run(folder, save):
-        print(f"stopped; go on with: python train.py resume={shlex.quote(str(folder))}")
+        print(f"stopped after {trainer.progress.update} updates; {go_on_line}")
         sys.exit(130)
     label = comparison.label_of(settings)
     learned = {label: experiment.make_checkpoint(settings, task, trainer)}
-    panels = comparison.evaluate_panels(settings, task, learned)
+    try:
+        panels = comparison.evaluate_panels(settings, task, learned)
+    except KeyboardInterrupt:
+        print(f"\ntrained, not evaluated; {go_on_line}")
+        sys.exit(130)
     reports.write_report(folder, panels, {label: trainer.progress.history})
     held_out = next(iter(panels.values()))[label]
-    reports.write_summary(folder, app.typed_overrides(), held_out)
+    reports.write_summary(folder, settings["overrides"], held_out)
+    if (folder.parent / "multirun.yaml").exists():  # Hydra's mark of a sweep
+        print(reports.sweep_table(folder.parent))
     return float(held_out.alignment[:, -1].mean())
 
 

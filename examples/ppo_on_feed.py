@@ -35,4 +35,5 @@ for data in Collector(env, actor, auto_register_policy_transforms=False, **frame
         (losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]).backward()
         optimizer.step()
         optimizer.zero_grad()
-    print(f"reward {data['next', 'reward'].mean():+.3f}, asks {data['action'].float().mean():.0%}")
+    final = data["next", "metrics", "alignment"][data["next", "done"]].mean()
+    print(f"asks {data['action'].float().mean():.0%}, alignment at the end {final:.2f}")

@@ -157,6 +157,20 @@ def test_surprising_answers_leave_neither_copies_nor_nan(
         assert ess.mean() > 50
 
 
+def test_soft_answers_are_never_left_out(generator: Generator) -> None:
+    """However surprising: a careless human, a belief that thinks them careful."""
+    normals = uniform_sphere((12, 2), generator)
+    gaps = normals.view(12, 1, 1, 2).expand(12, 20, 1, 2)
+    belief = Belief(Boltzmann(1000.0))
+    samples, ess = belief.prior(20, 2, generator), torch.full((20,), 100.0)
+    for h in range(12):
+        samples, ess, used = belief.update(
+            samples, ess, gaps[:h].transpose(0, 1), gaps[h], generator
+        )
+        assert used.all()
+    assert samples.isfinite().all()
+
+
 def test_identical_options_teach_nothing(belief: Belief, generator: Generator) -> None:
     queries = torch.ones(3, 2, 4)
     samples, ess = converse(belief, queries, torch.tensor([0, 1, 0]), 300, generator)

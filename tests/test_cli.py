@@ -111,6 +111,15 @@ def test_sweep_makes_one_table(tmp_path: Path) -> None:
     ]
     assert all(-1 <= float(row["alignment after 4"]) <= 1 for row in rows)
     assert "summary.csv" in output
+    before = (tmp_path / "sweep" / "summary.csv").read_text()
+    run("train.py", f"resume={tmp_path}/sweep/0")
+    assert (tmp_path / "sweep" / "summary.csv").read_text() == before
+    other = f"hydra.run.dir={tmp_path}/other/0"
+    run("train.py", "setup=query", "tau=optimal", "seed=4", *TINY, other)
+    both = f"checkpoint=[{tmp_path}/sweep/0,{tmp_path}/other/0]"
+    output = run("evaluate.py", both, f"hydra.run.dir={tmp_path}/both")
+    assert "RL (sweep/0)" in output
+    assert "RL (other/0)" in output
     output = run("evaluate.py", f"checkpoint={tmp_path}/sweep", f"hydra.run.dir={tmp_path}/all")
     for row in ("optimal user", "noisy user (tau=0.5)", "RL ", "RL-feed"):
         assert row in output
@@ -179,6 +188,12 @@ def test_help_explains_every_key(script: str) -> None:
         keys -= {"seed", "setup.candidates", "setup.repeats", "setup.on_skip"}
     for key in keys:
         assert re.search(rf"\b{re.escape(named.get(key, key))}\b", help_text), key
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        groups = {"query": compose(script, ["setup=query"]), "feed": compose(script)}
+    for key, value in re.findall(r"^ +([a-z_]+\.[a-z_]+)=(\S+)", help_text, re.M):
+        if not key.startswith("hydra."):
+            defaults = {str(OmegaConf.select(config, key)).lower() for config in groups.values()}
+            assert value.replace("null", "none") in defaults, key
 
 
 BAD_INPUT = [
@@ -207,11 +222,21 @@ BAD_INPUT = [
     ("train", "resume=nowhere", "nowhere: no such file"),
     ("train", "checkpoint=nowhere", "nowhere: no such file"),
     ("train", "checkpoint={tmp}/text.pt", "cannot be read as a torchrl_pref checkpoint"),
-    ("train", "pool.train={tmp}/none.pt", "none.pt: no such file"),
-    ("train", "pool.train={tmp}/constant.pt", "feature 2 never varies"),
-    ("train", "pool.test={tmp}/three.pt", "pool.test has K=3"),
-    ("train", "pool.test={tmp}/wide.pt", "D=5: expected D=4"),
+    ("train", "pool.test={tmp}/plain.pt", "expected both pool.train and pool.test"),
+    ("train", "pool.train={tmp}/none.pt pool.test={tmp}/wide.pt", "none.pt: no such file"),
+    ("train", "pool.train={tmp}/constant.pt pool.test={tmp}/plain.pt", "feature 2 never varies"),
+    ("train", "pool.train={tmp}/plain.pt pool.test={tmp}/three.pt", "pool.test has K=3"),
+    ("train", "pool.train={tmp}/plain.pt pool.test={tmp}/wide.pt", "D=5: expected D=4"),
     ("train", "hydra.run.dir={tmp}/text.pt/run", "the run folder cannot be written"),
+    ("train", "hydra.run.dir=/sys", "cannot be written"),
+    ("train", "belief=5", "belief is a section of keys"),
+    ("train", "setup.name=query", "type setup=query"),
+    ("train", "policy.name=paper", "type policy=paper"),
+    ("train", "pool.train=5 pool.test=5", "5: no such file"),
+    ("train", "checkpoint=5", "5: no such file"),
+    ("train", "resume=5", "no such file"),
+    ("train", "seed=99999999999999999999", "expected a whole number below"),
+    ("evaluate", "checkpoint=0", "checkpoint=0: no checkpoint.pt there"),
     ("evaluate", "checkpoint=nowhere", "checkpoint=nowhere: no checkpoint.pt there"),
     ("evaluate", "checkpoint={tmp}/text.pt", "cannot be read as a torchrl_pref checkpoint"),
     ("evaluate", "tau=loud", "tau='loud'"),
@@ -232,12 +257,13 @@ def test_bad_input_gets_one_line_status_2_and_no_files(
     (tmp_path / "text.pt").write_text("not a checkpoint")
     constant = torch.rand(9, 2, 4)
     constant[..., 2] = 3
+    QueryPool(torch.rand(9, 2, 4)).save(tmp_path / "plain.pt")
     QueryPool(constant).save(tmp_path / "constant.pt")
     QueryPool(torch.rand(9, 3, 4)).save(tmp_path / "three.pt")
     QueryPool(torch.rand(9, 2, 5)).save(tmp_path / "wide.pt")
     before = sorted(tmp_path.rglob("*"))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", [f"{script}.py", typed.format(tmp=tmp_path)])
+    monkeypatch.setattr(sys, "argv", [f"{script}.py", *typed.format(tmp=tmp_path).split()])
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")  # set by app.main; put back afterwards
     threads = torch.get_num_threads()
     with pytest.raises(SystemExit) as ended:
@@ -250,6 +276,26 @@ def test_bad_input_gets_one_line_status_2_and_no_files(
     assert printed.err.count("\n") == 1
     assert message in printed.err
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_run_is_never_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "train_pool.pt").write_text("somebody's")
+    process = start("train.py", *TINY, f"hydra.run.dir={tmp_path}")
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert "holds a run already (train_pool.pt)" in errors
+    assert os.listdir(tmp_path) == ["train_pool.pt"]
+
+
+def test_folders_that_the_user_made_are_kept(tmp_path: Path) -> None:
+    (tmp_path / "mine" / "run").mkdir(parents=True)
+    process = start("train.py", "tau=0", f"hydra.run.dir={tmp_path}/mine/run")
+    process.communicate(timeout=60)
+    assert process.returncode == 2
+    process = start("train.py", "tau=0", cwd=tmp_path / "mine" / "run")
+    process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["mine", "run"]
 
 
 def test_settings_that_a_checkpoint_brings_cannot_be_typed(tmp_path: Path) -> None:

@@ -167,7 +167,9 @@ def test_checkpoint_says_what_does_not_fit(tmp_path: Path) -> None:
 
     scorer, _ = trainer_of(settings_of("query"))
     make_checkpoint(settings_of("query"), task, scorer).save(tmp_path / "checkpoint.pt")
-    Checkpoint.load(tmp_path).check_fits(gridworld_pool(31))
+    Checkpoint.load(tmp_path).check_fits(gridworld_pool(31), own_indices=True)
+    with pytest.raises(InputError, match="picks indices of a training pool"):
+        checkpoint.check_fits(task.test, own_indices=True)
 
     gridworld_pool(30, seed=9).save(tmp_path / "train_pool.pt")
     gridworld_pool(30, seed=9).save(tmp_path / "test_pool.pt")
@@ -180,7 +182,7 @@ def test_foreign_and_old_checkpoints_are_refused(tmp_path: Path) -> None:
     gridworld_pool(30).save(tmp_path / "pool.pt")
     with pytest.raises(InputError, match="holds query pool; expected a torchrl_pref checkpoint"):
         Checkpoint.load(tmp_path / "pool.pt")
-    torch.save({"kind": "torchrl_pref checkpoint", "settings": {}}, tmp_path / "old.pt")
+    torch.save({"kind": "torchrl_pref checkpoint", "format": 0}, tmp_path / "old.pt")
     with pytest.raises(InputError, match="written by another version"):
         Checkpoint.load(tmp_path / "old.pt")
     with pytest.raises(InputError, match="no such file"):

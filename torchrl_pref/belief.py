@@ -23,7 +23,7 @@ from torchrl_pref.responses import ResponseModel
 from torchrl_pref.sampler import great_circle_step
 
 MAX_STAGES = 12
-"""An answer that fewer than 1 in 4¹² of the belief agree with contradicts the earlier answers."""
+"""Twelve stages that keep a quarter each: what no sample agrees with then is a contradiction."""
 
 MIN_SHARE = 0.25
 """Kish effective share of the samples that a reweighting must keep; below it a stage is added."""
@@ -114,12 +114,17 @@ class Belief:
         inflation = self.n_samples / ess
         slack = torch.full_like(ess, math.inf)
         todo = torch.arange(len(samples), device=samples.device)
-        for _ in range(MAX_STAGES):
+        for stage in range(MAX_STAGES):
             if todo.numel() == 0:
                 break
             gaps = torch.einsum("smd,skd->smk", result[todo], newest[todo])
             log_now = self._log_likelihood(gaps, slack[todo])
-            slack[todo] = self._next_slack(gaps, slack[todo], log_now)
+            next_slack = self._next_slack(gaps, slack[todo], log_now)
+            if stage == MAX_STAGES - 1:
+                # Better a few copies than no answer: only an impossible one is left out.
+                possible = self._log_likelihood(gaps, torch.zeros_like(next_slack)) > -math.inf
+                next_slack = torch.where(possible.any(1), 0.0, next_slack)
+            slack[todo] = next_slack
             log_weights = self._log_likelihood(gaps, slack[todo]) - log_now
             answers = torch.cat([earlier[todo], newest[todo].unsqueeze(1)], 1)
             result[todo], inflation[todo] = self._resample_move(
@@ -177,7 +182,8 @@ class Belief:
         floor = 1e-6 * torch.eye(start.shape[-1], device=start.device)
         scale = torch.linalg.cholesky_ex(covariance_of(start) + floor).L
         for step in range(self.n_moves):
-            # Isotropic poles reach everywhere; poles shaped by the spread travel along it.
+            # Isotropic poles reach everywhere; poles shaped by the spread travel along it. Each
+            # sample is 1/M of that spread: adaptive, and exact only as M grows.
             pole = torch.randn(start.shape, generator=generator, device=start.device)
             if step % 2:
                 pole = pole @ scale.mT

@@ -15,6 +15,9 @@ from torchrl_pref.queries import QueryPool, load_safely, save_atomically
 KIND = "torchrl_pref checkpoint"
 FILE_NAME = "checkpoint.pt"
 
+FORMAT = 1
+"""Raised whenever a key of the settings or of the checkpoint changes its meaning or its name."""
+
 
 @dataclass
 class Checkpoint:
@@ -59,7 +62,7 @@ class Checkpoint:
 
     def save(self, path: str | Path) -> None:
         """Write the checkpoint, whole or not at all."""
-        save_atomically({"kind": KIND, **asdict(self)}, path)
+        save_atomically({"kind": KIND, "format": FORMAT, **asdict(self)}, path)
 
     @classmethod
     def load(cls, path: str | Path) -> Checkpoint:
@@ -71,19 +74,23 @@ class Checkpoint:
         path = Path(path)
         content = load_safely(path / FILE_NAME if path.is_dir() else path, KIND)
         content.pop("kind")
-        if set(content) != set(cls.__dataclass_fields__):
-            differs = sorted(set(content) ^ set(cls.__dataclass_fields__))
+        found = content.pop("format", None)
+        if found != FORMAT or set(content) != set(cls.__dataclass_fields__):
             raise InputError(
-                f"{path}: written by another version of this package (differs in "
-                f"{', '.join(differs)}); train again, or use the version that wrote it"
+                f"{path}: written by another version of this package (format {found}, expected "
+                f"{FORMAT}); train again, or use the version that wrote it"
             )
         return cls(**content)
 
-    def check_fits(self, pool: QueryPool) -> None:
+    def check_fits(self, pool: QueryPool, own_indices: bool = False) -> None:
         """Refuse a pool on which this policy has no meaning.
 
+        Args:
+            pool: the queries, normalised.
+            own_indices: whether a policy that picks by index must be on its own training pool.
+
         Raises:
-            InputError: options, features or (for the paper's policy) queries differ.
+            InputError: options, features or (for a policy that picks by index) queries differ.
         """
         expected = dict(self.pool_shape)
         found = {"N": len(pool), "K": pool.n_options, "D": pool.n_features}
@@ -94,4 +101,10 @@ class Checkpoint:
             raise InputError(
                 f"the checkpoint does not fit the pool: {', '.join(differs)}; evaluate it on a "
                 "pool of the shape it was trained on, or train a policy for this pool"
+            )
+        if own_indices and self.picks_by_index and pool.digest != self.train_digest:
+            raise InputError(
+                "the checkpoint does not fit the pool: its policy picks indices of a training pool "
+                f"with digest {self.train_digest[:12]}, and this one has {pool.digest[:12]}; start "
+                "from a checkpoint of the same pool, or use policy=scorer"
             )

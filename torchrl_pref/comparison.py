@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from torchrl_pref.checkpoint import Checkpoint
 from torchrl_pref.envs import FeedEnv, QueryEnv
-from torchrl_pref.errors import InputError, check_count
+from torchrl_pref.errors import InputError, check_count, check_flag, check_seed
 from torchrl_pref.evaluation import Evaluation, draw_humans, evaluate
 from torchrl_pref.experiment import (
     Settings,
@@ -65,12 +65,11 @@ def check_evaluation(settings: Settings) -> tuple[int, int]:
     """How many humans, and their seed; call it before a training whose result they will judge.
 
     Raises:
-        InputError: they are too few, or the seed is negative.
+        InputError: they are too few, or the seed is out of range.
     """
     section = settings["evaluation"]
     n_humans = check_count("evaluation.humans", section["humans"], 2)
-    seed = check_count("evaluation.seed", section["seed"], 0)
-    return n_humans, FIRST_EVALUATION_SEED + seed
+    return n_humans, FIRST_EVALUATION_SEED + check_seed("evaluation.seed", section["seed"])
 
 
 def compare(
@@ -94,7 +93,7 @@ def compare(
     runs: list[tuple[str, QueryEnv | FeedEnv, TensorDictModuleBase, bool]] = []
 
     query_env = make_query_env(settings, task, pool, n_humans, seed)
-    runs.append(("random", query_env, RandomQuery(seed), False))
+    runs.append(("random", query_env, RandomQuery(seed + 1), False))
     runs.append(("greedy", query_env, Greedy(task.response_model), False))
     if settings["setup"]["name"] == "feed":
         runs.append(
@@ -102,7 +101,8 @@ def compare(
         )
     for name, checkpoint in learned.items():
         env, policy = _load_policy(checkpoint, task, pool, n_humans, seed)
-        runs.append((name, env, policy.strategy, checkpoint.settings["policy"]["sample"]))
+        sample = check_flag("policy.sample", checkpoint.settings["policy"]["sample"])
+        runs.append((name, env, policy.strategy, sample))
 
     results = {}
     for name, env, strategy, sample in tqdm(runs, desc="evaluation", unit="strategy"):
@@ -162,9 +162,11 @@ def group_checkpoints(
             label = label_of(checkpoint.settings)
             same = sum(label_of(other.settings) == label for _, other, _ in members)
             learned[label if same == 1 else f"{label} ({name})"] = checkpoint
-        # A feed's settings have all that a query environment needs, and not the other way round.
-        settings = max(
-            (c.settings for c in learned.values()), key=lambda s: s["setup"]["name"] == "feed"
+        # Baselines choose as the query runs may; a feed among them adds its offers.
+        settings = dict(first.settings)
+        by_feed_last = sorted(
+            (c.settings["setup"] for _, c, _ in members), key=lambda setup: setup["name"] == "feed"
         )
+        settings["setup"] = {key: value for setup in by_feed_last for key, value in setup.items()}
         panels.append((settings, task, learned))
     return panels

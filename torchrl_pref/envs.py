@@ -21,11 +21,15 @@ work and one environment serves any batch:
 ``offers`` (B O), ``candidates`` …    pool indices of the stream or of the candidates
 ``metrics``                           alignment, alignment_of_mean, information, ess (B 1)
 ====================================  ===========================================================
+
+The seed of the constructor is the same for every copy: call ``set_seed`` on a ``ParallelEnv``,
+which gives each worker its own seed, or the workers face the same humans.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -37,7 +41,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_pref.acquisition import information_gain
 from torchrl_pref.belief import Belief, feature_gaps
-from torchrl_pref.errors import InputError, check_choice, check_count
+from torchrl_pref.errors import InputError, check_choice, check_count, check_flag
 from torchrl_pref.humans import SimulatedHuman
 from torchrl_pref.queries import QueryPool
 
@@ -58,8 +62,8 @@ class SessionEnv(EnvBase):
         seed: int,
         device: torch.device | str,
     ) -> None:
-        if len(batch_size) != 1:
-            raise InputError(f"batch_size={tuple(batch_size)}: expected one size, such as (64,)")
+        if not isinstance(batch_size, Sequence) or len(batch_size) != 1:
+            raise InputError(f"batch_size={batch_size}: expected one size, such as (64,)")
         super().__init__(device=device, batch_size=torch.Size(batch_size))
         self.register_buffer("features", pool.features.to(device))
         self.human = human
@@ -231,7 +235,7 @@ class QueryEnv(SessionEnv):
                 f"setup.repeats=false with {self.n_candidates} candidates and setup.budget={budget}"
                 ": expected at least as many candidates as asks; raise one or lower the other"
             )
-        self.repeats = repeats
+        self.repeats = check_flag("setup.repeats", repeats)
         self._make_specs(self.n_candidates)
 
     def _fresh_state(self) -> TensorDict:

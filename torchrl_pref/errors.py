@@ -27,6 +27,28 @@ def check_count(name: str, value: Any, minimum: int) -> int:
     return value
 
 
+def check_seed(name: str, value: Any) -> int:
+    """Return ``value`` if it is a whole number from 0 to 2³¹ - 1.
+
+    Raises:
+        InputError: it is not.
+    """
+    if check_count(name, value, 0) >= 2**31:
+        raise InputError(f"{name}={value}: expected a whole number below 2147483648")
+    return int(value)
+
+
+def check_flag(name: str, value: Any) -> bool:
+    """Return ``value`` if it is true or false.
+
+    Raises:
+        InputError: it is not.
+    """
+    if not isinstance(value, bool):
+        raise InputError(f"{name}={value!r}: expected true or false")
+    return value
+
+
 def check_positive(name: str, value: Any) -> float:
     """Return ``value`` as a float if it is a finite number above zero.
 

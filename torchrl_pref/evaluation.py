@@ -69,7 +69,7 @@ def evaluate(
     mode = ExplorationType.RANDOM if sample else ExplorationType.DETERMINISTIC
     steps = env.n_offers if isinstance(env, FeedEnv) else env.budget
     session = env.reset(humans.clone(), set_state=True)
-    before = {name: session["metrics", name] for name in CURVES}
+    before = {name: session["metrics", name].cpu() for name in CURVES}
     start = time.perf_counter()
     with torch.no_grad(), set_exploration_type(mode):
         steps_taken = env.rollout(
@@ -80,6 +80,8 @@ def evaluate(
             break_when_all_done=True,
             return_contiguous=False,
         )["next"]
+    steps_taken = steps_taken.select("n_asked", "n_offered", "metrics", "history", strict=False)
+    steps_taken = steps_taken.to("cpu")
     seconds = time.perf_counter() - start
     n_asked = steps_taken["n_asked"].squeeze(-1)
     curves = {
@@ -101,7 +103,7 @@ def evaluate(
 def _by_answers(before: Tensor, values: Tensor, n_asked: Tensor, env: QueryEnv | FeedEnv) -> Tensor:
     """Curve (B H+1) by number of answers, from values (B T) by step and their start (B 1)."""
     curve = before.repeat(1, env.budget + 1)
-    columns = torch.arange(env.budget + 1, device=curve.device)
+    columns = torch.arange(env.budget + 1)
     for value, count in zip(values.unbind(1), n_asked.unbind(1), strict=True):
         # A skip changes nothing, so later steps with the same count write the same value again.
         curve = torch.where(columns >= count.unsqueeze(1), value.unsqueeze(1), curve)
@@ -115,10 +117,10 @@ def _count_repeats(history: Tensor) -> Tensor:
     return earlier.sum(-1)
 
 
-def bootstrap_interval(values: Tensor, seed: int = 0, resamples: int = 5000) -> tuple[float, float]:
+def bootstrap_interval(values: Tensor, seed: int = 0, resamples: int = 2000) -> tuple[float, float]:
     """Percentile bootstrap 95% interval of the mean of values (B) over humans."""
     generator = Generator().manual_seed(seed)
     picks = torch.randint(len(values), (resamples, len(values)), generator=generator)
-    means = values.cpu()[picks].mean(-1)
+    means = values[picks].mean(-1)
     low, high = torch.quantile(means, torch.tensor([0.025, 0.975])).tolist()
     return low, high

@@ -15,7 +15,7 @@ import torch
 from torchrl_pref.belief import Belief, uniform_sphere
 from torchrl_pref.checkpoint import Checkpoint
 from torchrl_pref.envs import FeedEnv, QueryEnv
-from torchrl_pref.errors import InputError, check_choice, check_count, check_positive
+from torchrl_pref.errors import InputError, check_choice, check_positive, check_seed
 from torchrl_pref.features import Normalizer
 from torchrl_pref.humans import SimulatedHuman
 from torchrl_pref.policies import Policy, paper_policy, scorer_policy
@@ -47,7 +47,7 @@ class Task:
     @property
     def title(self) -> str:
         """What kind of human this is, for tables and figures."""
-        return "optimal user" if self.tau is None else f"noisy user (tau={self.tau:.3g})"
+        return "optimal user" if self.tau is None else f"noisy user (tau={self.tau:.4g})"
 
     @property
     def response_model(self) -> ResponseModel:
@@ -65,12 +65,18 @@ def make_pools(settings: Settings) -> tuple[QueryPool, QueryPool]:
         InputError: a setting or a file cannot be used.
     """
     pool, grid = settings["pool"], settings["grid"]
+    given = [name for name in ("train", "test") if pool[name] is not None]
+    if len(given) == 1:
+        raise InputError(
+            f"pool.{given[0]}={pool[given[0]]} alone: the other pool would be the Gridworld's; "
+            "expected both pool.train and pool.test of your own, or neither"
+        )
     # Each pool takes two seeds, one for the starts and one for the moves.
-    first_seed = 4 * check_count("pool.seed", pool["seed"], 0)
+    first_seed = 4 * check_seed("pool.seed", pool["seed"])
     pools = []
     for path, seed in ((pool["train"], first_seed), (pool["test"], first_seed + 2)):
         if path is not None:
-            pools.append(QueryPool.load(path))
+            pools.append(QueryPool.load(str(path)))
         else:
             size, length = grid["size"], grid["length"]
             pools.append(gridworld_pool(pool["size"], pool["options"], size, length, seed))
@@ -177,7 +183,7 @@ def make_trainer(settings: Settings, task: Task) -> Trainer:
         InputError: a setting is out of range.
     """
     a2c = A2CSettings(**settings["training"])
-    seed = check_count("seed", settings["seed"], 0)
+    seed = check_seed("seed", settings["seed"])
     env: QueryEnv | FeedEnv
     if settings["setup"]["name"] == "feed":
         env = make_feed_env(settings, task, task.train, a2c.sessions, seed)

@@ -35,6 +35,11 @@ def check_features(features: Tensor) -> Tensor:
     Raises:
         InputError: the shape is not (N, K ≥ 2, D ≥ 2), or a value is NaN or infinite.
     """
+    if not isinstance(features, Tensor):
+        raise InputError(
+            f"features of type {type(features).__name__}: expected a torch.Tensor; "
+            "torch.as_tensor(…) makes one of an array or of lists"
+        )
     shape = tuple(features.shape)
     if features.ndim != 3 or shape[0] < 1 or shape[1] < 2 or shape[2] < 2:
         raise InputError(

@@ -188,7 +188,8 @@ def paper_policy(env: QueryEnv | FeedEnv) -> Policy:
 
     In the query setup an action is an index of the training pool and means nothing on another one.
     The networks are those of Stable-Baselines3's ``MlpPolicy``, two hidden layers of 64 tanh units
-    for the actor and as many for the critic (https://stable-baselines3.readthedocs.io).
+    for the actor and as many for the critic (https://stable-baselines3.readthedocs.io), but with
+    torch's initialisation and not the orthogonal one.
 
     Args:
         env: gives the sizes.

@@ -5,6 +5,7 @@ Shapes: N queries, K options per query, D features, T trajectory length.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 from collections.abc import Callable
@@ -111,14 +112,23 @@ def gridworld_pool(
 
 
 def save_atomically(content: dict[str, Any], path: str | Path) -> None:
-    """Write plain data and tensors to a file, so that a reader never sees half of it."""
+    """Write plain data and tensors to a file, so that a reader never sees half of it.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
     path = Path(path)
     partial = path.with_name(path.name + ".partial")
     try:
         torch.save(content, partial)
         os.replace(partial, path)
+    except (OSError, RuntimeError) as error:  # torch reports a full disk as the latter
+        raise InputError(
+            f"{path}: cannot be written ({error}); free some space there, or name another folder"
+        ) from error
     finally:
-        partial.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            partial.unlink()
 
 
 def load_safely(path: str | Path, kind: str) -> dict[str, Any]:

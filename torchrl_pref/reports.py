@@ -51,7 +51,7 @@ def alignment_table(results: Results, style: str = "simple") -> str:
             [
                 NAMES.get(name, name),
                 *(f"{result.alignment[:, j].mean():.3f}" for j in columns),
-                "{:.3f} to {:.3f}".format(*bootstrap_interval(final)),
+                "[{:.3f}, {:.3f}]".format(*bootstrap_interval(final)),
                 *(
                     "" if name == other else _difference(final - results[other].alignment[:, -1])
                     for other in ("greedy", "random")
@@ -61,9 +61,9 @@ def alignment_table(results: Results, style: str = "simple") -> str:
     headers = [
         "strategy",
         *(f"after {j}" for j in columns),
-        "95% interval",
-        "less greedy [95%]",
-        "less random [95%]",
+        f"after {budget} [95%]",
+        "minus greedy [95%]",
+        "minus random [95%]",
     ]
     return tabulate(rows, headers, tablefmt=style, disable_numparse=True)
 
@@ -121,12 +121,16 @@ def figure_1(panels: Mapping[str, Results], path: Path) -> None:
     for axis, (title, results) in zip(axes.flat, panels.items(), strict=False):
         for name, result in results.items():
             _draw_curve(axis, name, result.alignment)
-        axis.set(title=title, xlabel="queries asked", xlim=(0, None), ylim=(None, 1))
+        axis.set(title=title, xlabel="queries asked", xlim=(0, None), ylim=(None, 1.02))
         axis.xaxis.get_major_locator().set_params(integer=True)
         axis.grid(alpha=0.25)
         axis.legend(frameon=False, loc="lower right")
     for row in axes:
         row[0].set_ylabel("alignment (mean of cosines)")
+    n_humans = len(next(iter(next(iter(panels.values())).values())).asked)
+    figure.supxlabel(
+        f"{n_humans} humans, bands are 95% intervals", fontsize="small", color="#555555"
+    )
     _save(figure, path)
 
 
@@ -182,7 +186,10 @@ def write_report(
     """
     tables = []
     for title, results in panels.items():
-        tables += [title, "", alignment_table(results), "", detail_table(results), ""]
+        n_humans = len(next(iter(results.values())).asked)
+        heading = f"{title}, {n_humans} humans: alignment after so many queries"
+        tables += [heading, "", alignment_table(results), ""]
+        tables += ["after the last query", "", detail_table(results), ""]
     text = "\n".join(tables)
     print("\n" + text)
     (folder / "tables.txt").write_text(text)

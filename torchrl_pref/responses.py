@@ -98,6 +98,7 @@ class Boltzmann(ResponseModel):
         """See :meth:`ResponseModel.__call__`."""
         if returns.shape[-1] == 2:
             return super().__call__(returns)
+        # The same for all K options at once, in K exponentials and not K².
         return torch.log_softmax(self.tau * returns, -1)
 
     def __repr__(self) -> str:
@@ -129,18 +130,6 @@ class Optimal(ResponseModel):
         return "Optimal()"
 
 
-def accuracy(tau: float, returns: Tensor) -> float:
-    """Mean probability that a Boltzmann human picks the best option.
-
-    Args:
-        tau: the human's tau.
-        returns: (… K), returns of the options of each query under each human.
-    """
-    gaps = returns.max(-1, keepdim=True).values - returns
-    others = gaps.sort(-1).values[..., 1:]
-    return Boltzmann(tau).log_likelihood(others).exp().mean(dtype=torch.float64).item()
-
-
 def calibrate_tau(returns: Tensor, target: float = 0.9) -> float:
     """The tau at which the best option is picked with probability ``target`` on average.
 
@@ -148,18 +137,23 @@ def calibrate_tau(returns: Tensor, target: float = 0.9) -> float:
 
     Args:
         returns: (… K), returns of the options of the training pool under humans of the prior.
-        target: mean accuracy, above 1/K and below 1.
+        target: mean probability of the best option, above 1/K and below 1.
 
     Raises:
         InputError: no tau up to 10⁶ reaches the target (most options tie).
     """
+    gaps = (returns.amax(-1, keepdim=True) - returns).sort(-1).values[..., 1:]
+
+    def accuracy(tau: float) -> float:
+        return Boltzmann(tau).log_likelihood(gaps).exp().mean(dtype=torch.float64).item()
+
     low, high = 1e-6, 1e6
-    if not accuracy(low, returns) < target < accuracy(high, returns):
+    if not accuracy(low) < target < accuracy(high):
         raise InputError(
             f"an accuracy of {target} cannot be reached: tau between {low:g} and {high:g} gives "
-            f"{accuracy(low, returns):.3f} to {accuracy(high, returns):.3f}; give tau as a number"
+            f"{accuracy(low):.3f} to {accuracy(high):.3f}; give tau as a number"
         )
     while high / low > 1 + 1e-6:
         middle = math.sqrt(low * high)
-        low, high = (middle, high) if accuracy(middle, returns) < target else (low, middle)
+        low, high = (middle, high) if accuracy(middle) < target else (low, middle)
     return math.sqrt(low * high)

@@ -31,7 +31,7 @@ def great_circle_step(
 ) -> Tensor:
     """Move every sample once, along the great circle through it and its pole.
 
-    The posterior is left invariant as long as a pole is drawn independently of its sample. On that
+    The posterior is left invariant if a pole is drawn independently of its sample. On that
     circle the uniform measure of the sphere has density |sin ∠(ω, pole)|^(D-2): the meridians of a
     sphere crowd at its poles.
 

@@ -221,7 +221,8 @@ def _latest(history: dict[str, list[float]]) -> dict[str, str]:
     latest = {}
     for name, values in history.items():
         known = (value for value in reversed(values) if not math.isnan(value))
-        latest[name.split("/")[-1]] = f"{next(known, math.nan):.3g}"
+        number = next(known, None)
+        latest[name.split("/")[-1]] = "-" if number is None else f"{number:.3g}"
     return latest
 
 

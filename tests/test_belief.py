@@ -180,12 +180,13 @@ def test_identical_options_teach_nothing(belief: Belief, generator: Generator) -
 
 def test_bracket_ends_at_the_nearest_crossings(generator: Generator) -> None:
     chains, answers = 300, 5
-    cosine, sine, depth = torch.randn(3, chains, answers, 1, generator=generator).unbind()
+    cosine, sine, depth = torch.randn(3, answers, 1, chains, generator=generator).unbind()
     least = cosine - depth.abs()
     low, high = bracket(cosine, sine, least, torch.rand(chains, generator=generator))
     angles = torch.linspace(-2 * math.pi, 2 * math.pi, 20001)
     for c in range(chains):
-        inside = (cosine[c] * angles.cos() + sine[c] * angles.sin() >= least[c] - 1e-6).all(0)
+        gaps = cosine[..., c] * angles.cos() + sine[..., c] * angles.sin()
+        inside = (gaps >= least[..., c] - 1e-6).all(0)
         if inside.all():
             assert float(high[c] - low[c]) == pytest.approx(2 * math.pi, abs=1e-4)
             continue

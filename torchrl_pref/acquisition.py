@@ -1,4 +1,4 @@
-"""Acquisition functions: what a query is expected to teach, from the belief's answer log-probs.
+"""Acquisition functions: what a query is expected to teach, from what the belief predicts.
 
 Shapes: B sessions, C candidate queries, M belief samples, K options per query, R possible answers,
 D features, ``…`` any leading dimensions.
@@ -12,13 +12,13 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torchrl_pref.responses import ResponseModel
+from torchrl_pref.responses import Prediction, ResponseModel
 
 CHUNK = 500_000
 """Returns (B c M K) held at once while candidates are scored: bounds memory and fits the cache."""
 
 
-def information_gain(log_probs: Tensor) -> Tensor:
+def information_gain(predicted: Prediction) -> Tensor:
     r"""Mutual information between the answer and ω, in bits (the paper's section 3.3).
 
     .. math:: r = \frac{1}{M} \sum_{q_i \in Q} \sum_{\omega \in \Omega} P(q_i \mid Q, \omega)
@@ -28,34 +28,32 @@ def information_gain(log_probs: Tensor) -> Tensor:
     the same sum without a quotient of probabilities that may both underflow.
 
     Args:
-        log_probs: (… M R), natural log-probability of each answer under each sample.
+        predicted: of the answer, under M samples.
 
     Returns:
         (…), between 0 (all samples agree) and log2 R.
     """
-    probs = log_probs.exp()
-    of_mean = torch.special.entr(probs.mean(-2)).sum(-1)
-    # The clamp keeps 0 · log 0 from being NaN; it changes no product that float32 can hold.
-    mean_of = -(probs * log_probs.clamp(min=-1e4)).mean(-2).sum(-1)
-    return ((of_mean - mean_of) / math.log(2)).clamp(0, math.log2(log_probs.shape[-1]))
+    of_mean = torch.special.entr(predicted.probs.mean(-2)).sum(-1)
+    highest = math.log2(predicted.probs.shape[-1])
+    return ((of_mean - predicted.entropy) / math.log(2)).clamp(0, highest)
 
 
-def volume_removal(log_probs: Tensor) -> Tensor:
+def volume_removal(predicted: Prediction) -> Tensor:
     r"""Expected share of the belief that the answer removes, :math:`1 - \sum_q \bar p_q^2`.
 
     Sadigh, Dragan, Sastry and Seshia, *Active preference-based learning of reward functions*,
     2017.
 
     Args:
-        log_probs: (… M R), natural log-probability of each answer under each sample.
+        predicted: of the answer, under M samples.
 
     Returns:
         (…), between 0 and 1 - 1/R.
     """
-    return 1 - log_probs.exp().mean(-2).square().sum(-1)
+    return 1 - predicted.probs.mean(-2).square().sum(-1)
 
 
-def expected_alignment(log_probs: Tensor, samples: Tensor) -> Tensor:
+def expected_alignment(predicted: Prediction, samples: Tensor) -> Tensor:
     r"""Expected squared length of the mean belief after the answer.
 
     .. math:: \sum_q P(q) \, \lVert E[\omega \mid q] \rVert^2
@@ -64,14 +62,14 @@ def expected_alignment(log_probs: Tensor, samples: Tensor) -> Tensor:
     (the mean cosine between its samples and the human's ω).
 
     Args:
-        log_probs: (… C M R), natural log-probability of each answer under each sample.
+        predicted: of the answers to C candidates, under M samples.
         samples: (… M D), the belief samples.
 
     Returns:
         (… C), between ‖E[ω]‖² and 1 for unit samples.
     """
-    total = torch.zeros(log_probs.shape[:-2], device=log_probs.device)
-    for probs in log_probs.exp().unbind(-1):
+    total = torch.zeros_like(predicted.entropy)
+    for probs in predicted.probs.unbind(-1):
         joint_mean = probs @ samples / samples.shape[-2]
         total += joint_mean.square().sum(-1) / probs.mean(-1).clamp(min=1e-30)
     return total
@@ -81,7 +79,7 @@ def score_queries(
     samples: Tensor,
     queries: Tensor,
     response_model: ResponseModel,
-    score: Callable[[Tensor], Tensor] = information_gain,
+    score: Callable[[Prediction], Tensor] = information_gain,
 ) -> Tensor:
     """Score every candidate, in chunks so that memory stays bounded whatever C is.
 
@@ -89,7 +87,7 @@ def score_queries(
         samples: (B M D), the belief.
         queries: (B C K D), the candidates.
         response_model: how the belief thinks the human answers.
-        score: from log-probabilities (B c M R) of some candidates to (B c …).
+        score: from what is predicted of c of the candidates to (B c …).
 
     Returns:
         (B C …).
@@ -99,5 +97,5 @@ def score_queries(
     for chunk in torch.split(queries, step, 1):
         # M is the innermost axis in memory, as the sums over it are the bulk of the work.
         returns = (chunk.flatten(1, 2) @ samples.mT).unflatten(1, chunk.shape[1:3]).mT
-        scores.append(score(response_model(returns)))
+        scores.append(score(response_model.predict(returns)))
     return torch.cat(scores, 1)

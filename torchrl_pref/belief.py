@@ -77,7 +77,7 @@ class Belief:
         InputError: ``samples`` or ``moves`` is too small.
     """
 
-    def __init__(self, response_model: ResponseModel, samples: int = 100, moves: int = 4) -> None:
+    def __init__(self, response_model: ResponseModel, samples: int = 100, moves: int = 6) -> None:
         self.response_model = response_model
         self.n_samples = check_count("belief.samples", samples, 2)
         self.n_moves = check_count("belief.moves", moves, 1)
@@ -177,16 +177,14 @@ class Belief:
         copies = torch.zeros_like(log_weights).scatter_add_(1, chosen, torch.ones_like(log_weights))
         inflation = inflation * copies.square().mean(1)
         start = samples.gather(1, chosen.unsqueeze(-1).expand_as(samples))
-        moved = start
-        # The floor keeps a belief that has shrunk to a point from having no directions at all.
+        # Circles are turned to where the samples spread. Each sample is 1/M of that spread:
+        # adaptive, and exact only as M grows. The floor keeps every direction possible.
         floor = 1e-6 * torch.eye(start.shape[-1], device=start.device)
         scale = torch.linalg.cholesky_ex(covariance_of(start) + floor).L
-        for step in range(self.n_moves):
-            # Isotropic poles reach everywhere; poles shaped by the spread travel along it. Each
-            # sample is 1/M of that spread: adaptive, and exact only as M grows.
-            pole = torch.randn(start.shape, generator=generator, device=start.device)
-            if step % 2:
-                pole = pole @ scale.mT
+        moved = start
+        for _ in range(self.n_moves):
+            normal = torch.randn(start.shape, generator=generator, device=start.device)
+            pole = normal @ scale.mT
             moved = great_circle_step(moved, pole, answers, slack, self.response_model, generator)
         kept = _correlation(start, moved).clamp(min=0).square()
         return moved, (1 + kept * (inflation - 1)).clamp(max=self.n_samples)

@@ -140,8 +140,7 @@ class SessionEnv(EnvBase):
         """(B 1), information gain in bits of pool query ``index`` (B) under the belief."""
         options = self.features[index]
         returns = tensordict["samples"] @ options.mT
-        log_probs = self.belief.response_model(returns)
-        return information_gain(log_probs).unsqueeze(-1)
+        return information_gain(self.belief.response_model.predict(returns)).unsqueeze(-1)
 
     def _ask(
         self, tensordict: TensorDictBase, index: Tensor, information: Tensor, asked: Tensor

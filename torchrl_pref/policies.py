@@ -26,7 +26,7 @@ from torchrl_pref.acquisition import (
 )
 from torchrl_pref.belief import covariance_of
 from torchrl_pref.envs import FeedEnv, QueryEnv
-from torchrl_pref.responses import ResponseModel
+from torchrl_pref.responses import Prediction, ResponseModel
 
 N_CANDIDATE = 7
 """F, see :class:`CandidateFeatures`."""
@@ -81,10 +81,10 @@ class CandidateFeatures(nn.Module):
         """From samples (B M D) and candidates (B C K D) to features (B C F)."""
         mean = samples.mean(1)
 
-        def expected(log_probs: Tensor) -> Tensor:
-            alignment = expected_alignment(log_probs, samples)
+        def expected(predicted: Prediction) -> Tensor:
+            alignment = expected_alignment(predicted, samples)
             return torch.stack(
-                [information_gain(log_probs), alignment, volume_removal(log_probs)], -1
+                [information_gain(predicted), alignment, volume_removal(predicted)], -1
             )
 
         gain, alignment, removal = score_queries(

@@ -13,12 +13,22 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from torchrl_pref.errors import InputError, check_positive
+
+
+class Prediction(NamedTuple):
+    """What M samples of the weights predict of the answer to a query."""
+
+    probs: Tensor
+    """(… M R), probability of each answer under each sample."""
+    entropy: Tensor
+    """(…), entropy of the answer in nats, averaged over the samples."""
 
 
 class ResponseModel(ABC):
@@ -34,6 +44,17 @@ class ResponseModel(ABC):
         Returns:
             (…), natural logarithm.
         """
+
+    def joint_log_likelihood(self, gaps: Tensor) -> Tensor:
+        """Log-probability of a whole history of answers.
+
+        Args:
+            gaps: (… H K-1), as in :meth:`log_likelihood`.
+
+        Returns:
+            (…), natural logarithm.
+        """
+        return self.log_likelihood(gaps).sum(-1)
 
     @abstractmethod
     def least_gap(self, log_likelihood: Tensor) -> Tensor:
@@ -65,6 +86,18 @@ class ResponseModel(ABC):
         # Answers outermost in memory: what follows reduces over samples, one answer at a time.
         return torch.stack(log_probs).movedim(0, -1)
 
+    def predict(self, returns: Tensor) -> Prediction:
+        """What M samples of the weights predict of the answer.
+
+        Args:
+            returns: (… M K), the return of each option under each sample.
+        """
+        log_probs = self(returns)
+        probs = log_probs.exp()
+        # The clamp keeps 0 · log 0 from being NaN; it changes no product that float32 can hold.
+        entropy = -(probs * log_probs.clamp(min=-1e4)).mean(-2).sum(-1)
+        return Prediction(probs, entropy)
+
 
 class Boltzmann(ResponseModel):
     r"""The paper's noisily rational human (section 3.2).
@@ -88,6 +121,14 @@ class Boltzmann(ResponseModel):
             return F.logsigmoid(self.tau * gaps.squeeze(-1))
         return -torch.logsumexp(F.pad(-self.tau * gaps, (1, 0)), -1)
 
+    def joint_log_likelihood(self, gaps: Tensor) -> Tensor:
+        """See :meth:`ResponseModel.joint_log_likelihood`."""
+        if gaps.shape[-1] > 1:
+            return super().joint_log_likelihood(gaps)
+        # log σ(z) = min(z, 0) + log σ(|z|)
+        logit = self.tau * gaps.squeeze(-1)
+        return logit.clamp(max=0).sum(-1) + sum_of_logs(logit.abs().sigmoid_())
+
     def least_gap(self, log_likelihood: Tensor) -> Tensor:
         """See :meth:`ResponseModel.least_gap`."""
         # No option is chosen more often than it beats any one other, whose log is log σ(τ g).
@@ -100,6 +141,20 @@ class Boltzmann(ResponseModel):
             return super().__call__(returns)
         # The same for all K options at once, in K exponentials and not K².
         return torch.log_softmax(self.tau * returns, -1)
+
+    def predict(self, returns: Tensor) -> Prediction:
+        """See :meth:`ResponseModel.predict`."""
+        if returns.shape[-1] > 2:
+            return super().predict(returns)
+        # With q = σ(-|z|), the probability of the less likely answer, the entropy is
+        # |z| q - log(1 - q): one exponential a sample, and nothing that cancels.
+        logit = self.tau * (returns[..., 0] - returns[..., 1])
+        size = logit.abs()
+        unlikely = (-size).sigmoid_()
+        likely = 1 - unlikely
+        entropy = size.mul_(unlikely).mean(-1) - sum_of_logs(likely) / size.shape[-1]
+        first = torch.where(logit > 0, likely, unlikely)
+        return Prediction(torch.stack([first, 1 - first]).movedim(0, -1), entropy)
 
     def __repr__(self) -> str:
         return f"Boltzmann(tau={self.tau:g})"
@@ -128,6 +183,21 @@ class Optimal(ResponseModel):
 
     def __repr__(self) -> str:
         return "Optimal()"
+
+
+def sum_of_logs(probs: Tensor) -> Tensor:
+    """Sum over the last dimension of the logs of numbers between ½ and 1.
+
+    64 of them can be multiplied before float32 underflows, and one logarithm is taken where there
+    would be 64. The rounding of the product is that of a sum of 64 numbers.
+
+    Args:
+        probs: (… n).
+
+    Returns:
+        (…).
+    """
+    return torch.stack([part.prod(-1) for part in probs.split(64, -1)]).log().sum(0)
 
 
 def calibrate_tau(returns: Tensor, target: float = 0.9) -> float:

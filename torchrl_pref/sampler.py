@@ -17,8 +17,9 @@ from torch.nn import functional as F
 
 from torchrl_pref.responses import ResponseModel
 
-MAX_SHRINKS = 60
-"""A bracket of 2π about halves each time: 60 halvings reach the limit of float32."""
+MAX_SHRINKS = 20
+"""Shrinks of a bracket before a sample stays where it is. The same shrinks lead back from where it
+would have gone, so that giving up leaves the posterior invariant too."""
 
 
 def great_circle_step(
@@ -53,27 +54,29 @@ def great_circle_step(
     tangents = across / height
     pole_angle = torch.atan2(height, along).reshape(-1)
 
-    rows = answers.flatten(1, 2).mT
-    shape = (n_sessions * n_samples, *answers.shape[1:3])
-    cosine, sine = (samples @ rows).view(shape), (tangents @ rows).view(shape)
-    raised = slack.repeat_interleave(n_samples).unsqueeze(-1)
+    # Chains are innermost in memory: every operation below then runs along them.
+    size = (*answers.shape[1:3], n_sessions * n_samples)
+    rows = answers.flatten(1, 2)
+    cosine = (rows @ samples.mT).transpose(0, 1).reshape(size)
+    sine = (rows @ tangents.mT).transpose(0, 1).reshape(size)
+    raised = slack.repeat_interleave(n_samples)
 
     def log_density(angle: Tensor, circle: tuple[Tensor, ...]) -> Tensor:
         """(c), of the points at ``angle`` (c) on some circles."""
         cosine, sine, raised, pole_angle = circle
-        turn = angle[:, None, None]
-        gaps = torch.addcmul(cosine * turn.cos(), sine, turn.sin())
-        gaps[:, -1] += raised
+        gaps = torch.addcmul(cosine * angle.cos(), sine, angle.sin())
+        gaps[-1] += raised
         meridian = (pole_angle - angle).sin().abs().clamp(min=1e-30).log()
-        return response_model.log_likelihood(gaps).sum(-1) + (n_features - 2) * meridian
+        likelihood = response_model.joint_log_likelihood(gaps.movedim(-1, 0))
+        return likelihood + (n_features - 2) * meridian
 
     angle = torch.zeros_like(pole_angle)
     uniform = torch.rand((2, len(angle)), generator=generator, device=angle.device)
     circle: tuple[Tensor, ...] = (cosine, sine, raised, pole_angle)
     threshold = log_density(angle, circle) + uniform[0].log()
     # Every factor of the density is at most one, so no single answer falls below the threshold.
-    least = response_model.least_gap(threshold)[:, None, None].repeat(1, *shape[1:])
-    least[:, -1] -= raised
+    least = response_model.least_gap(threshold).repeat(*size[:2], 1)
+    least[-1] -= raised
     low, high = bracket(cosine, sine, least, uniform[1])
     todo = torch.arange(len(angle), device=angle.device)
     for _ in range(MAX_SHRINKS):
@@ -86,7 +89,7 @@ def great_circle_step(
         if left.numel() == 0:
             break
         todo, proposal, threshold = todo[left], proposal[left], threshold[left]
-        circle = tuple(part[left] for part in circle)
+        circle = tuple(part.index_select(-1, left) for part in circle)
         high = torch.where(proposal > 0, proposal, high[left])
         low = torch.where(proposal > 0, low[left], proposal)
     turn = angle.view(n_sessions, n_samples, 1)
@@ -102,8 +105,8 @@ def bracket(cosine: Tensor, sine: Tensor, least: Tensor, uniform: Tensor) -> tup
     inverse per chain is needed.
 
     Args:
-        cosine, sine: (C H K-1), a and b of each gap.
-        least: (C H K-1) or broadcastable, g; where g exceeds a, rounding is at work.
+        cosine, sine: (H K-1 C), a and b of each gap.
+        least: (H K-1 C) or broadcastable, g; where g exceeds a, rounding is at work.
         uniform: (C), places the bracket of a circle without crossings.
 
     Returns:
@@ -116,8 +119,8 @@ def bracket(cosine: Tensor, sine: Tensor, least: Tensor, uniform: Tensor) -> tup
     far = size / (cosine - least).clamp(min=1e-30)
     rising = sine >= 0
     upper, lower = torch.where(rising, near, far), torch.where(rising, -far, -near)
-    cotangent_high = upper.nan_to_num(nan=-math.inf).flatten(1).amax(1)
-    cotangent_low = lower.nan_to_num(nan=math.inf).flatten(1).amin(1)
+    cotangent_high = upper.nan_to_num(nan=-math.inf).amax((0, 1))
+    cotangent_low = lower.nan_to_num(nan=math.inf).amin((0, 1))
     one = torch.ones_like(uniform)
     high = 2 * torch.atan2(one, cotangent_high)
     low = -2 * torch.atan2(one, -cotangent_low)

@@ -18,7 +18,7 @@ from torch import Generator, Tensor
 
 from torchrl_pref.acquisition import information_gain, score_queries
 from torchrl_pref.errors import check_share
-from torchrl_pref.responses import ResponseModel
+from torchrl_pref.responses import Prediction, ResponseModel
 
 
 class RandomQuery(TensorDictModuleBase):
@@ -47,7 +47,7 @@ class Greedy(TensorDictModuleBase):
 
     Args:
         response_model: how the belief thinks the human answers.
-        acquisition: from log-probabilities (… M R) to a value (…); information gain by default.
+        acquisition: from what is predicted of the answers to a value; information gain by default.
     """
 
     in_keys = ["samples", "queries", "action_mask"]
@@ -56,7 +56,7 @@ class Greedy(TensorDictModuleBase):
     def __init__(
         self,
         response_model: ResponseModel,
-        acquisition: Callable[[Tensor], Tensor] = information_gain,
+        acquisition: Callable[[Prediction], Tensor] = information_gain,
     ) -> None:
         super().__init__()
         self.response_model = response_model

@@ -14,11 +14,14 @@ from torch import Tensor
 
 from torchrl_pref.responses import Prediction, ResponseModel
 
-CHUNK = 500_000
-"""Returns (B c M K) held at once while candidates are scored: bounds memory and fits the cache."""
+CHUNK = 100_000
+"""Returns (B c M K-1) held at once while candidates are scored: bounds memory, fits the cache."""
+
+Acquisition = Callable[[Prediction, Tensor], Tensor]
+"""From what M belief samples (B M D) predict of the answers to C candidates to values (B C …)."""
 
 
-def information_gain(predicted: Prediction) -> Tensor:
+def information_gain(predicted: Prediction, samples: Tensor) -> Tensor:
     r"""Mutual information between the answer and ω, in bits (the paper's section 3.3).
 
     .. math:: r = \frac{1}{M} \sum_{q_i \in Q} \sum_{\omega \in \Omega} P(q_i \mid Q, \omega)
@@ -28,27 +31,29 @@ def information_gain(predicted: Prediction) -> Tensor:
     the same sum without a quotient of probabilities that may both underflow.
 
     Args:
-        predicted: of the answer, under M samples.
+        predicted: of the answers to C candidates, under M samples.
+        samples: (… M D), the belief samples; not needed here.
 
     Returns:
-        (…), between 0 (all samples agree) and log2 R.
+        (… C), between 0 (all samples agree) and log2 R.
     """
     of_mean = torch.special.entr(predicted.probs.mean(-2)).sum(-1)
     highest = math.log2(predicted.probs.shape[-1])
     return ((of_mean - predicted.entropy) / math.log(2)).clamp(0, highest)
 
 
-def volume_removal(predicted: Prediction) -> Tensor:
+def volume_removal(predicted: Prediction, samples: Tensor) -> Tensor:
     r"""Expected share of the belief that the answer removes, :math:`1 - \sum_q \bar p_q^2`.
 
     Sadigh, Dragan, Sastry and Seshia, *Active preference-based learning of reward functions*,
     2017.
 
     Args:
-        predicted: of the answer, under M samples.
+        predicted: of the answers to C candidates, under M samples.
+        samples: (… M D), the belief samples; not needed here.
 
     Returns:
-        (…), between 0 and 1 - 1/R.
+        (… C), between 0 and 1 - 1/R.
     """
     return 1 - predicted.probs.mean(-2).square().sum(-1)
 
@@ -75,27 +80,52 @@ def expected_alignment(predicted: Prediction, samples: Tensor) -> Tensor:
     return total
 
 
-def score_queries(
-    samples: Tensor,
-    queries: Tensor,
-    response_model: ResponseModel,
-    score: Callable[[Prediction], Tensor] = information_gain,
-) -> Tensor:
-    """Score every candidate, in chunks so that memory stays bounded whatever C is.
+def predict_answers(samples: Tensor, queries: Tensor, response_model: ResponseModel) -> Prediction:
+    """What the belief predicts of the answer to each candidate.
 
     Args:
         samples: (B M D), the belief.
         queries: (B C K D), the candidates.
         response_model: how the belief thinks the human answers.
-        score: from what is predicted of c of the candidates to (B c …).
+    """
+    leads = queries[..., :-1, :] - queries[..., -1:, :]
+    # M is the innermost axis in memory, as the sums over it are the bulk of the work.
+    returns = (leads.flatten(1, 2) @ samples.mT).unflatten(1, leads.shape[1:3])
+    return response_model.predict(returns.mT)
+
+
+def score_queries(
+    samples: Tensor,
+    queries: Tensor,
+    response_model: ResponseModel,
+    acquisition: Acquisition,
+) -> Tensor:
+    """Score every candidate, in chunks so that memory stays bounded whatever B, C and M are.
+
+    Args:
+        samples: (B M D), the belief.
+        queries: (B C K D), the candidates.
+        response_model: how the belief thinks the human answers.
+        acquisition: what makes the score; it may return several numbers, (B c …).
 
     Returns:
         (B C …).
     """
-    step = max(1, CHUNK // (samples.shape[0] * samples.shape[1] * queries.shape[2]))
-    scores = []
-    for chunk in torch.split(queries, step, 1):
-        # M is the innermost axis in memory, as the sums over it are the bulk of the work.
-        returns = (chunk.flatten(1, 2) @ samples.mT).unflatten(1, chunk.shape[1:3]).mT
-        scores.append(score(response_model.predict(returns)))
-    return torch.cat(scores, 1)
+    sessions, candidates = queries.shape[:2]
+    fits = max(1, CHUNK // (samples.shape[1] * (queries.shape[2] - 1)))
+    step = min(fits, candidates)
+    group = max(1, fits // step)
+    rows = []
+    for start in range(0, sessions, group):
+        belief = samples[start : start + group]
+        chunks = queries[start : start + group].split(step, 1)
+        rows.append(
+            torch.cat(
+                [
+                    acquisition(predict_answers(belief, chunk, response_model), belief)
+                    for chunk in chunks
+                ],
+                1,
+            )
+        )
+    return torch.cat(rows)

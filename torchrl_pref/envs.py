@@ -39,7 +39,7 @@ from torch.nn import functional as F
 from torchrl.data import Binary, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_pref.acquisition import information_gain
+from torchrl_pref.acquisition import information_gain, predict_answers
 from torchrl_pref.belief import Belief, feature_gaps
 from torchrl_pref.errors import InputError, check_choice, check_count, check_flag
 from torchrl_pref.humans import SimulatedHuman
@@ -138,9 +138,9 @@ class SessionEnv(EnvBase):
 
     def _information(self, tensordict: TensorDictBase, index: Tensor) -> Tensor:
         """(B 1), information gain in bits of pool query ``index`` (B) under the belief."""
-        options = self.features[index]
-        returns = tensordict["samples"] @ options.mT
-        return information_gain(self.belief.response_model.predict(returns)).unsqueeze(-1)
+        samples, queries = tensordict["samples"], self.features[index].unsqueeze(1)
+        predicted = predict_answers(samples, queries, self.belief.response_model)
+        return information_gain(predicted, samples)
 
     def _ask(
         self, tensordict: TensorDictBase, index: Tensor, information: Tensor, asked: Tensor

@@ -81,14 +81,8 @@ class CandidateFeatures(nn.Module):
         """From samples (B M D) and candidates (B C K D) to features (B C F)."""
         mean = samples.mean(1)
 
-        def expected(predicted: Prediction) -> Tensor:
-            alignment = expected_alignment(predicted, samples)
-            return torch.stack(
-                [information_gain(predicted), alignment, volume_removal(predicted)], -1
-            )
-
         gain, alignment, removal = score_queries(
-            samples, queries, self.response_model, expected
+            samples, queries, self.response_model, _all_acquisitions
         ).unbind(-1)
         centred = queries - queries.mean(-2, keepdim=True)
         covariance = covariance_of(samples)
@@ -99,6 +93,12 @@ class CandidateFeatures(nn.Module):
         return torch.stack(
             [gain, alignment - now, removal, variance.sqrt(), variance, apart, length], -1
         )
+
+
+def _all_acquisitions(predicted: Prediction, samples: Tensor) -> Tensor:
+    """Information gain, expected alignment and volume removal, (B C 3)."""
+    functions = (information_gain, expected_alignment, volume_removal)
+    return torch.stack([function(predicted, samples) for function in functions], -1)
 
 
 class BeliefFeatures(nn.Module):

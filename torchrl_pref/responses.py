@@ -86,13 +86,14 @@ class ResponseModel(ABC):
         # Answers outermost in memory: what follows reduces over samples, one answer at a time.
         return torch.stack(log_probs).movedim(0, -1)
 
-    def predict(self, returns: Tensor) -> Prediction:
+    def predict(self, leads: Tensor) -> Prediction:
         """What M samples of the weights predict of the answer.
 
         Args:
-            returns: (… M K), the return of each option under each sample.
+            leads: (… M K-1), by how much the return of each option exceeds that of the last one,
+                under each sample.
         """
-        log_probs = self(returns)
+        log_probs = self(F.pad(leads, (0, 1)))
         probs = log_probs.exp()
         # The clamp keeps 0 · log 0 from being NaN; it changes no product that float32 can hold.
         entropy = -(probs * log_probs.clamp(min=-1e4)).mean(-2).sum(-1)
@@ -142,19 +143,18 @@ class Boltzmann(ResponseModel):
         # The same for all K options at once, in K exponentials and not K².
         return torch.log_softmax(self.tau * returns, -1)
 
-    def predict(self, returns: Tensor) -> Prediction:
+    def predict(self, leads: Tensor) -> Prediction:
         """See :meth:`ResponseModel.predict`."""
-        if returns.shape[-1] > 2:
-            return super().predict(returns)
-        # With q = σ(-|z|), the probability of the less likely answer, the entropy is
-        # |z| q - log(1 - q): one exponential a sample, and nothing that cancels.
-        logit = self.tau * (returns[..., 0] - returns[..., 1])
-        size = logit.abs()
-        unlikely = (-size).sigmoid_()
-        likely = 1 - unlikely
-        entropy = size.mul_(unlikely).mean(-1) - sum_of_logs(likely) / size.shape[-1]
-        first = torch.where(logit > 0, likely, unlikely)
-        return Prediction(torch.stack([first, 1 - first]).movedim(0, -1), entropy)
+        if leads.shape[-1] > 1:
+            return super().predict(leads)
+        # With q the probability of the less likely answer and z the logit, the entropy is
+        # |z| q - log(1 - q): no logarithm of each sample, and no term that can cancel another.
+        logit = self.tau * leads.squeeze(-1)
+        first = torch.sigmoid(logit)
+        second = 1 - first
+        unlikely, likely = torch.minimum(first, second), torch.maximum(first, second)
+        entropy = (logit.abs() * unlikely).mean(-1) - sum_of_logs(likely) / logit.shape[-1]
+        return Prediction(torch.stack([first, second]).movedim(0, -1), entropy)
 
     def __repr__(self) -> str:
         return f"Boltzmann(tau={self.tau:g})"
@@ -180,6 +180,14 @@ class Optimal(ResponseModel):
     def least_gap(self, log_likelihood: Tensor) -> Tensor:
         """See :meth:`ResponseModel.least_gap`."""
         return torch.full_like(log_likelihood, -self.tolerance)
+
+    def predict(self, leads: Tensor) -> Prediction:
+        """See :meth:`ResponseModel.predict`."""
+        if leads.shape[-1] > 1:
+            return super().predict(leads)
+        winner = F.hardshrink(leads.squeeze(-1), self.tolerance).sign()  # 1, -1, or 0 for a tie
+        entropy = math.log(2) * (1 - winner.abs().mean(-1))
+        return Prediction(torch.stack([winner + 1, 1 - winner]).movedim(0, -1) / 2, entropy)
 
     def __repr__(self) -> str:
         return "Optimal()"

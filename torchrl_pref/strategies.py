@@ -9,16 +9,15 @@ through the same ``env.rollout``.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Generator, Tensor
+from torch import Generator
 
-from torchrl_pref.acquisition import information_gain, score_queries
+from torchrl_pref.acquisition import Acquisition, information_gain, score_queries
 from torchrl_pref.errors import check_share
-from torchrl_pref.responses import Prediction, ResponseModel
+from torchrl_pref.responses import ResponseModel
 
 
 class RandomQuery(TensorDictModuleBase):
@@ -47,7 +46,7 @@ class Greedy(TensorDictModuleBase):
 
     Args:
         response_model: how the belief thinks the human answers.
-        acquisition: from what is predicted of the answers to a value; information gain by default.
+        acquisition: the value of a candidate; information gain by default.
     """
 
     in_keys = ["samples", "queries", "action_mask"]
@@ -56,7 +55,7 @@ class Greedy(TensorDictModuleBase):
     def __init__(
         self,
         response_model: ResponseModel,
-        acquisition: Callable[[Prediction], Tensor] = information_gain,
+        acquisition: Acquisition = information_gain,
     ) -> None:
         super().__init__()
         self.response_model = response_model

@@ -1,0 +1,98 @@
+"""What the benchmarks share: paired timings, one table, JSON.
+
+Each benchmark is one command, ``python benchmarks/<name>.py [--json FILE]``. Cases that are
+compared take turns within one run, on one torch thread, and the median of each counts: a machine
+that slows down slows all of them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from tabulate import tabulate
+
+from torchrl_pref.belief import uniform_sphere
+from torchrl_pref.features import Normalizer
+from torchrl_pref.queries import QueryPool, gridworld_pool
+
+TAU = 4.5
+"""About what ``tau=noisy`` solves to on the default pool."""
+
+Row = dict[str, Any]
+
+
+def arguments(description: str | None) -> argparse.ArgumentParser:
+    """A parser with what every benchmark takes."""
+    parser = argparse.ArgumentParser(description=(description or "").strip().split("\n")[0])
+    parser.add_argument("--json", type=Path, help="also write the rows to this file")
+    parser.add_argument("--repeats", type=int, default=9, help="timings of each case (default 9)")
+    return parser
+
+
+def start(parser: argparse.ArgumentParser) -> argparse.Namespace:
+    """Read the command line and set torch to one thread."""
+    torch.set_num_threads(1)
+    return parser.parse_args()
+
+
+def devices() -> list[str]:
+    """The CPU, and a GPU where one is present."""
+    return ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
+
+
+def paired(cases: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
+    """Median CPU seconds of each case; the cases take turns, after one warm-up each.
+
+    On a GPU the work is waited for and wall time counts; give such cases a name with "cuda" in it.
+    """
+    seconds: dict[str, list[float]] = {name: [] for name in cases}
+    for case in cases.values():
+        case()
+    for _ in range(repeats):
+        for name, case in cases.items():
+            seconds[name].append(_time(case, "cuda" in name))
+    return {name: statistics.median(times) for name, times in seconds.items()}
+
+
+def _time(case: Callable[[], Any], on_gpu: bool) -> float:
+    """Seconds of one call."""
+    if not on_gpu:
+        start = time.process_time()
+        case()
+        return time.process_time() - start
+    torch.cuda.synchronize()
+    start = time.perf_counter()
+    case()
+    torch.cuda.synchronize()
+    return time.perf_counter() - start
+
+
+def report(title: str, rows: Sequence[Row], json_path: Path | None) -> None:
+    """Print one table, and write it as JSON where asked."""
+    machine = f"{platform.machine()}, torch {torch.__version__}, one thread"
+    print(f"\n{title}\n{machine}\n")
+    print(tabulate(rows, headers="keys", floatfmt=".4g"))
+    if json_path is not None:
+        content = {"title": title, "machine": machine, "rows": list(rows)}
+        json_path.write_text(json.dumps(content, indent=1) + "\n")
+        print(f"\nwritten to {json_path}")
+
+
+def normalised_pool(n_queries: int = 1000) -> QueryPool:
+    """The default Gridworld pool, normalised."""
+    pool = gridworld_pool(n_queries)
+    return pool.map_features(Normalizer.fit(pool.features))
+
+
+def belief_samples(n_sessions: int, n_samples: int = 100, n_features: int = 4) -> torch.Tensor:
+    """Samples (S M D) of the prior."""
+    shape = (n_sessions, n_samples, n_features)
+    return uniform_sphere(shape, torch.Generator().manual_seed(0))

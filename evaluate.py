@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import os
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,14 @@ import hydra
 from omegaconf import DictConfig
 
 import app
-from torchrl_pref import comparison, experiment, reports
+from torchrl_pref import comparison, experiment, heldout, heldout_report, reports
 from torchrl_pref.checkpoint import FILE_NAME, Checkpoint
-from torchrl_pref.errors import InputError, one_line_errors
+from torchrl_pref.errors import InputError, check_choice, check_count, one_line_errors
+from torchrl_pref.pretrained import SEEDS, pretrained_checkpoint
 from torchrl_pref.queries import QueryPool
+
+Evaluated = tuple[comparison.Panels, dict[str, dict[str, list[float]]]]
+"""Panels of evaluations, and the training histories behind them."""
 
 
 @hydra.main(config_path="conf", config_name="evaluate", version_base="1.3")
@@ -28,7 +33,14 @@ def job(config: DictConfig) -> None:
             settings = app.plain_settings(config)
             app.use_threads(settings)
             named = settings["checkpoint"]
-            if named is None:
+            for key, word in (("protocol", "heldout"), ("policy", "pretrained")):
+                if settings[key] is not None:
+                    check_choice(key, settings[key], (word,))
+            if settings["protocol"] is not None:
+                run_heldout(settings, folder)
+            elif named is None and settings["policy"] is not None:
+                reports.write_report(folder, *evaluate_pretrained(settings))
+            elif named is None:
                 reports.write_report(folder, evaluate_baselines(settings), {})
             else:
                 allowed = ("evaluation.", "pool.test", "device", "threads", "hydra.")
@@ -50,6 +62,40 @@ def evaluate_baselines(settings: dict[str, Any]) -> comparison.Panels:
     return panels
 
 
+def evaluate_pretrained(settings: dict[str, Any]) -> Evaluated:
+    """The policies that come with the package beside the baselines, a panel for each tau."""
+    taus = settings["tau"] if isinstance(settings["tau"], list) else [settings["tau"]]
+    pools = experiment.make_pools(settings)
+    setup = settings["setup"]["name"]
+    panels: comparison.Panels = {}
+    for tau in taus:
+        checkpoint = pretrained_checkpoint(setup, tau)
+        label = f"{comparison.label_of(checkpoint.settings)} (pretrained)"
+        task = experiment.make_task(*pools, tau)
+        panels |= comparison.evaluate_panels(settings, task, {label: checkpoint})
+    return panels, {}
+
+
+def run_heldout(settings: dict[str, Any], folder: Path) -> None:
+    """The held-out protocol, for checkpoints or for the policies that come with the package."""
+    learned: dict[heldout.Cell, list[Checkpoint]] = {}
+    if settings["checkpoint"] is None:
+        for setup, tau in product(("query", "feed"), ("noisy", "optimal")):
+            learned[heldout.Cell(setup, tau)] = [
+                pretrained_checkpoint(setup, tau, seed) for seed in range(SEEDS)
+            ]
+    else:
+        named = settings["checkpoint"]
+        for path in find_checkpoints(
+            [str(n) for n in (named if isinstance(named, list) else [named])]
+        ):
+            checkpoint = Checkpoint.load(path)
+            cell = heldout.Cell(checkpoint.settings["setup"]["name"], checkpoint.settings["tau"])
+            learned.setdefault(cell, []).append(checkpoint)
+    workers = check_count("workers", settings["workers"], 1)
+    heldout_report.write_heldout(folder, heldout.run_protocol(settings, learned, workers))
+
+
 def find_checkpoints(named: list[str]) -> list[Path]:
     """The checkpoint files meant by files, run folders and sweep folders.
 
@@ -68,9 +114,7 @@ def find_checkpoints(named: list[str]) -> list[Path]:
     return paths
 
 
-def evaluate_checkpoints(
-    settings: dict[str, Any], paths: list[Path]
-) -> tuple[comparison.Panels, dict[str, dict[str, list[float]]]]:
+def evaluate_checkpoints(settings: dict[str, Any], paths: list[Path]) -> Evaluated:
     """Learned policies beside random and greedy, a panel for each kind of human."""
     runs = []
     common = Path(os.path.commonpath([path.parent.parent for path in paths]))

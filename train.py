@@ -57,6 +57,7 @@ def begin(folder: Path, settings: dict[str, Any], start: str | None) -> float:
         checkpoint = Checkpoint.load(start)
         checkpoint.check_fits(task.train, own_indices=True)
         experiment.load_weights(trainer.policy, checkpoint)
+        trainer.start_average()
     for pool, name in zip(pools, POOLS, strict=True):
         pool.save(folder / name)
     OmegaConf.save(settings, folder / "config.yaml")

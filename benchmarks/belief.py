@@ -20,6 +20,7 @@ import importlib.util
 import math
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -71,7 +72,7 @@ def main() -> None:
                 shown, picked = queries[:count].double().numpy(), answers[:count].numpy()
                 samplers["APReL"] = Measured(
                     samplers["Metropolis, NumPy"].means,
-                    _cpu(lambda: peers.aprel_belief(aprel, shown, picked, common.TAU)),
+                    _cpu(partial(peers.aprel_belief, aprel, shown, picked, common.TAU)),
                 )
                 sizes["APReL"] = sizes["Metropolis, NumPy"]
             speed = {name: sizes[name] / samplers[name].seconds for name in samplers}
@@ -205,7 +206,7 @@ def _emcee(gaps: peers.Array, tau: float) -> Sampler:
 
     def sample(start: peers.Array, rng: np.random.Generator) -> peers.Array:
         sampler = emcee.EnsembleSampler(*start.shape, log_density, vectorize=True)
-        sampler.random_state = np.random.RandomState(rng.integers(2**31)).get_state()  # noqa: NPY002
+        sampler.random_state = np.random.RandomState(rng.integers(2**31)).get_state()
         sampler.run_mcmc(start * np.sqrt(rng.chisquare(start.shape[1], (len(start), 1))), 200)
         weights = sampler.get_chain(discard=100, flat=True)
         return weights / np.linalg.norm(weights, axis=1, keepdims=True)

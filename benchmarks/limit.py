@@ -2,8 +2,9 @@
 
 ``python benchmarks/limit.py``. Scoring N queries under M samples takes a model of each of N·M
 answers; the ceiling is one ``exp`` and one ``log`` over N·M numbers that lie in the cache, timed in
-the same run. The belief's Markov step evaluates H answers for each of S·M samples a few times over; its ceiling
-is one ``exp`` and one ``log`` for each evaluation that it made. ``--compile`` adds ``torch.compile``.
+the same run. The belief's Markov step evaluates H answers for each of S·M samples a few times over;
+its ceiling is one ``exp`` and one ``log`` for each evaluation that it made. ``--compile`` adds
+``torch.compile``.
 """
 
 from __future__ import annotations

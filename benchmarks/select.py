@@ -1,8 +1,8 @@
 """CPU seconds to choose the best of N queries by information gain, ours beside others'.
 
 ``python benchmarks/select.py``. "APReL's way" is a NumPy loop with one logsumexp per query and
-sample; APReL itself is timed where it is importable (see ``peers.py``), BoTorch's PairwiseGP where it is
-installed (``pip install -e ".[bench]"``). All of the first four choose the same query.
+sample; APReL itself is timed where it is importable (see ``peers.py``), BoTorch's PairwiseGP where
+it is installed (``pip install -e ".[bench]"``). All of the first four choose the same query.
 """
 
 from __future__ import annotations

@@ -12,12 +12,16 @@ LAYERS = [
     {"responses"},
     {"acquisition", "sampler"},
     {"belief", "features", "gridworld"},
-    {"queries", "humans"},
+    {"queries", "humans", "objectives"},
     {"envs"},
-    {"strategies", "policies"},
+    {"strategies"},
+    {"scorer", "attention"},
+    {"policies"},
     {"checkpoint", "evaluation", "training"},
     {"experiment"},
-    {"comparison", "reports"},
+    {"comparison", "pretrained"},
+    {"heldout", "reports"},
+    {"heldout_report"},
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 

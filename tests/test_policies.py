@@ -6,12 +6,15 @@ from test_envs import ENVS, make
 from torch import Generator
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from torchrl_pref.acquisition import expected_alignment, information_gain
+from torchrl_pref.attention import TOKENS, belief_tokens
+from torchrl_pref.belief import covariance_of
 from torchrl_pref.envs import FeedEnv, QueryEnv
-from torchrl_pref.errors import InputError
-from torchrl_pref.policies import Policy, paper_policy, scorer_policy
+from torchrl_pref.objectives import make_objective
+from torchrl_pref.policies import Policy, attention_policy, paper_policy, scorer_policy
 from torchrl_pref.queries import QueryPool
 from torchrl_pref.responses import ResponseModel
-from torchrl_pref.strategies import Greedy, RandomAsk, RandomQuery
+from torchrl_pref.strategies import QuantileAsk, RandomAsk, RandomQuery
 
 
 def session_of(env: QueryEnv | FeedEnv) -> TensorDictBase:
@@ -56,25 +59,75 @@ def test_scorer_works_on_a_pool_of_another_size_and_dimension(
         assert data["logits"].isfinite().all()
 
 
+@pytest.mark.parametrize("objective", ["alignment", "information_gain"])
 @pytest.mark.parametrize("model", RESPONSE_MODELS, ids=str)
-def test_scorer_starts_as_greedy(model: ResponseModel, pool: QueryPool) -> None:
-    env = make(QueryEnv, pool, model, batch=20)
+def test_scorer_starts_as_the_greedy_strategy_of_its_objective(
+    model: ResponseModel, objective: str, pool: QueryPool
+) -> None:
+    env = make(QueryEnv, pool, model, batch=20, objective=objective)
     session = session_of(env)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        learned = scorer_policy(env).strategy(session.clone())
-    greedy = Greedy(model)(session.clone())["action"]
-    gain = learned["candidate_features"][..., 0]
+        chosen = scorer_policy(env).strategy(session.clone())["action"]
+    forecast = make_objective(objective).forecast(session, session["queries"], model)
     rows = torch.arange(20)
-    assert torch.allclose(gain[rows, learned["action"]], gain[rows, greedy], atol=1e-6)
+    assert torch.allclose(forecast[rows, chosen], forecast.amax(1), atol=1e-5)
 
 
-def test_offer_scorer_starts_undecided(pool: QueryPool) -> None:
-    env = make(FeedEnv, pool)
-    assert (scorer_policy(env).strategy(session_of(env))["logits"] == 0).all()
+@pytest.mark.parametrize("objective", ["alignment", "information_gain"])
+def test_offer_scorer_starts_as_the_quantile_rule(objective: str, pool: QueryPool) -> None:
+    env = make(FeedEnv, pool, batch=50, objective=objective, skip="free")
+    acquisition = expected_alignment if objective == "alignment" else information_gain
+    rule = QuantileAsk(env, acquisition)
+    data = env.rollout(12, rule, break_when_any_done=False)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        learned = scorer_policy(env).strategy(data.clone().reshape(-1))["action"]
+    assert (learned == data["action"].reshape(-1)).float().mean() > 0.99
+    assert 0.05 < data["action"].float().mean() < 0.95
 
 
 @pytest.mark.parametrize("kind", ENVS)
-@pytest.mark.parametrize("make_policy", [paper_policy, scorer_policy])
+@pytest.mark.parametrize("tokens", TOKENS)
+def test_attention_does_not_care_about_the_order_of_options_or_samples(
+    kind: type, tokens: str, pool: QueryPool, generator: Generator
+) -> None:
+    env = make(kind, pool)
+    policy = disturbed(attention_policy(env, tokens), generator)
+    session = session_of(env)
+    key = "queries" if kind is QueryEnv else "offer"
+    swapped = session.clone()
+    swapped[key] = session[key].flip(-2).contiguous()
+    swapped["samples"] = session["samples"].flip(1).contiguous()
+    logits, other = (policy.strategy(td)["logits"] for td in (session, swapped))
+    assert torch.allclose(logits, other, atol=1e-4)
+    assert logits.std() > 0.01
+
+
+def test_attention_sees_no_more_than_its_tokens(generator: Generator) -> None:
+    samples = torch.randn(3, 50, 4, generator=generator) + 1
+    whitened = torch.linalg.solve_triangular(
+        torch.linalg.cholesky(covariance_of(samples)),
+        (samples - samples.mean(1, True)).mT,
+        upper=False,
+    )
+    other = torch.randn(3, 50, 4, generator=generator)
+    other = torch.linalg.solve_triangular(
+        torch.linalg.cholesky(covariance_of(other)), (other - other.mean(1, True)).mT, upper=False
+    )
+    # Another sample of the same mean and covariance.
+    twin = (torch.linalg.cholesky(covariance_of(samples)) @ other).mT + samples.mean(1, True)
+    assert not torch.allclose(whitened, other, atol=0.1)
+    for kind in ("mean", "covariance"):
+        tokens = belief_tokens(samples, kind)
+        assert torch.allclose(tokens.mean(1), samples.mean(1), atol=1e-4)
+        assert torch.allclose(tokens, belief_tokens(twin, kind), atol=1e-3)
+    spread = belief_tokens(samples, "covariance")
+    expected = covariance_of(spread) * spread.shape[1] / 2
+    assert torch.allclose(expected, covariance_of(samples), atol=1e-4)
+    assert torch.equal(belief_tokens(samples, "samples"), samples)
+
+
+@pytest.mark.parametrize("kind", ENVS)
+@pytest.mark.parametrize("make_policy", [paper_policy, scorer_policy, attention_policy])
 def test_batch_equals_singles(
     make_policy: object, kind: type, pool: QueryPool, generator: Generator
 ) -> None:
@@ -91,23 +144,3 @@ def test_batch_equals_singles(
 def test_paper_policy_sees_the_mean_and_the_offer_only(pool: QueryPool) -> None:
     assert set(paper_policy(make(QueryEnv, pool)).strategy.in_keys) <= {"mean", "action_mask"}
     assert set(paper_policy(make(FeedEnv, pool)).strategy.in_keys) == {"mean", "offer"}
-
-
-def test_random_strategies_have_their_own_seeded_luck(pool: QueryPool) -> None:
-    session = session_of(make(QueryEnv, pool, batch=2000))
-    session["action_mask"][:, 5:] = False
-    actions = RandomQuery(1)(session)["action"]
-    assert actions.bincount(minlength=5).tolist() == pytest.approx([400] * 5, abs=5 * 18)
-    assert torch.equal(actions, RandomQuery(1)(session)["action"])
-    offers = session_of(make(FeedEnv, pool, batch=2000))
-    assert float(RandomAsk(0.3)(offers)["action"].float().mean()) == pytest.approx(0.3, abs=0.05)
-    assert (RandomAsk(1.0)(offers)["action"] == 1).all()
-    with pytest.raises(InputError, match="probability=2"):
-        RandomAsk(2)
-
-
-def test_greedy_obeys_the_mask(pool: QueryPool) -> None:
-    env = make(QueryEnv, pool, repeats=False)
-    greedy = Greedy(RESPONSE_MODELS[0])
-    asked = env.rollout(5, greedy)["next", "history", "queries"][:, -1]
-    assert all(len(row.unique()) == 5 for row in asked)

@@ -53,6 +53,7 @@ def settings_of(setup: str = "feed", policy: str = "scorer", **training: Any) ->
             "entropy": 0.01,
             "critic": 0.5,
             "grad_norm": 0.5,
+            "average": 0.9,
             "save_every": 2,
             **training,
         },

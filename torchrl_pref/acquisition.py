@@ -115,17 +115,39 @@ def score_queries(
     fits = max(1, CHUNK // (samples.shape[1] * (queries.shape[2] - 1)))
     step = min(fits, candidates)
     group = max(1, fits // step)
-    rows = []
+    scores = None
     for start in range(0, sessions, group):
-        belief = samples[start : start + group]
-        chunks = queries[start : start + group].split(step, 1)
-        rows.append(
-            torch.cat(
-                [
-                    acquisition(predict_answers(belief, chunk, response_model), belief)
-                    for chunk in chunks
-                ],
-                1,
-            )
-        )
-    return torch.cat(rows)
+        belief, shown = samples[start : start + group], queries[start : start + group]
+        for first in range(0, candidates, step):
+            predicted = predict_answers(belief, shown[:, first : first + step], response_model)
+            values = acquisition(predicted, belief)
+            if scores is None:
+                scores = values.new_empty(sessions, candidates, *values.shape[2:])
+            scores[start : start + group, first : first + step] = values
+    assert scores is not None
+    return scores
+
+
+def rank_offer(
+    samples: Tensor,
+    offer: Tensor,
+    reference: Tensor,
+    response_model: ResponseModel,
+    acquisition: Acquisition,
+) -> Tensor:
+    """The share of a reference set of queries that an offered query scores above.
+
+    Args:
+        samples: (B M D), the belief.
+        offer: (B K D), the offered query.
+        reference: (N K D), what may be offered.
+        response_model: how the belief thinks the human answers.
+        acquisition: what makes the score; it may return several numbers, (B c …).
+
+    Returns:
+        (B …), from 0 to 1.
+    """
+    queries = torch.cat([offer.unsqueeze(1), reference.expand(len(offer), *reference.shape)], 1)
+    scores = score_queries(samples, queries, response_model, acquisition)
+    # The margin keeps a query from outranking itself by rounding.
+    return (scores[:, :1] > scores[:, 1:] + 1e-6).float().mean(1)

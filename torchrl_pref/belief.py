@@ -25,6 +25,9 @@ from torchrl_pref.sampler import great_circle_step
 MAX_STAGES = 12
 """Twelve stages that keep a quarter each: what no sample agrees with then is a contradiction."""
 
+GROUP = 128
+"""Sessions that are moved at once: bounds memory and fits the cache."""
+
 MIN_SHARE = 0.25
 """Kish effective share of the samples that a reweighting must keep; below it a stage is added."""
 
@@ -105,11 +108,28 @@ class Belief:
         Args:
             samples: (S M D), samples of the belief before the answer.
             ess: (S), their effective sample size.
-            earlier: (S H K-1 D), :func:`feature_gaps` of the earlier answers; zero rows are
-                ignored, H may be 0.
+            earlier: (S H K-1 D), :func:`feature_gaps` of the earlier answers; zero rows come
+                last and are ignored, H may be 0.
             newest: (S K-1 D), feature gaps of the answer to condition on.
             generator: the source of all randomness, on the device of the samples.
         """
+        if len(samples) <= GROUP:
+            return self._update(samples, ess, earlier, newest, generator)
+        # Sessions with as many answers go together, so that none pays for another's.
+        n_answers = (earlier != 0).any(-1).any(-1).sum(1)
+        order = n_answers.argsort(stable=True)
+        updates = []
+        for group in order.split(GROUP):
+            rows = int(n_answers[group[-1]])
+            session = samples[group], ess[group], earlier[group, :rows], newest[group]
+            updates.append(self._update(*session, generator))
+        back = order.argsort()
+        return Update(*(torch.cat(parts)[back] for parts in zip(*updates, strict=True)))
+
+    def _update(
+        self, samples: Tensor, ess: Tensor, earlier: Tensor, newest: Tensor, generator: Generator
+    ) -> Update:
+        """:meth:`update` for as many sessions as are held in memory at once."""
         result = samples.clone()
         inflation = self.n_samples / ess
         slack = torch.full_like(ess, math.inf)

@@ -43,6 +43,7 @@ from torchrl_pref.acquisition import information_gain, predict_answers
 from torchrl_pref.belief import Belief, feature_gaps
 from torchrl_pref.errors import InputError, check_choice, check_count, check_flag
 from torchrl_pref.humans import SimulatedHuman
+from torchrl_pref.objectives import make_objective
 from torchrl_pref.queries import QueryPool
 
 
@@ -58,6 +59,7 @@ class SessionEnv(EnvBase):
         human: SimulatedHuman,
         belief: Belief,
         budget: int,
+        objective: str,
         batch_size: tuple[int, ...],
         seed: int,
         device: torch.device | str,
@@ -68,6 +70,8 @@ class SessionEnv(EnvBase):
         self.register_buffer("features", pool.features.to(device))
         self.human = human
         self.belief = belief
+        self.objective = objective
+        self._objective = make_objective(objective)
         self.budget = check_count("setup.budget", budget, 1)
         self._set_seed(seed)
 
@@ -171,7 +175,7 @@ class SessionEnv(EnvBase):
     def _finish(
         self, state: TensorDict, reward: Tensor, truncated: Tensor | None = None
     ) -> TensorDict:
-        """Add observation, reward and done flags to the next state."""
+        """Add reward and done flags to the observed next state."""
         terminated = state["n_asked"] >= self.budget
         if truncated is None:
             truncated = torch.zeros_like(terminated)
@@ -181,7 +185,7 @@ class SessionEnv(EnvBase):
             "truncated": truncated & ~terminated,
             "done": terminated | truncated,
         }
-        return self._observe(state).update(flags)
+        return state.update(flags)
 
     @abstractmethod
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase: ...
@@ -190,9 +194,9 @@ class SessionEnv(EnvBase):
 class QueryEnv(SessionEnv):
     r"""The paper's first formulation: the action is which query to ask (section 3.3).
 
-    State: the belief. Action: the index of a candidate. Reward: the information gain in bits of the
-    asked query, :math:`r = H(\omega \mid Q) - E_{q_i} H(\omega \mid q_i, Q)`. The episode ends
-    after H answers.
+    State: the belief. Action: the index of a candidate. Reward: what the answer adds to the
+    objective; for the paper's it is the information gain in bits of the asked query,
+    :math:`r = H(\omega \mid Q) - E_{q_i} H(\omega \mid q_i, Q)`. The episode ends after H answers.
 
     Args:
         pool: the queries, normalised.
@@ -203,6 +207,7 @@ class QueryEnv(SessionEnv):
             a fresh random subset for each session, so that a policy learns to choose and not to
             remember. None puts the whole pool on the table, in order.
         repeats: whether a query may be asked again.
+        objective: a name of ``objectives.OBJECTIVES``; the default is the paper's.
         batch_size: (B,), sessions that run side by side.
         seed: seeds the environment's own generator; the global generators are never used.
         device: where the tensors live.
@@ -221,11 +226,12 @@ class QueryEnv(SessionEnv):
         budget: int = 20,
         candidates: int | None = None,
         repeats: bool = True,
+        objective: str = "information_gain",
         batch_size: tuple[int, ...] = (64,),
         seed: int = 0,
         device: torch.device | str = "cpu",
     ) -> None:
-        super().__init__(pool, human, belief, budget, batch_size, seed, device)
+        super().__init__(pool, human, belief, budget, objective, batch_size, seed, device)
         self.n_candidates = len(pool)
         if candidates is not None:
             self.n_candidates = min(check_count("setup.candidates", candidates, 1), len(pool))
@@ -269,30 +275,36 @@ class QueryEnv(SessionEnv):
         index = tensordict["candidates"].gather(-1, action).squeeze(-1)
         gain = self._information(tensordict, index)
         asked = tensordict["n_asked"].squeeze(-1) < self.budget
-        return self._finish(self._ask(tensordict, index, gain, asked), gain * asked.unsqueeze(-1))
+        state = self._observe(self._ask(tensordict, index, gain, asked))
+        reward = self._objective.potential(state) - self._objective.potential(tensordict)
+        return self._finish(state, reward)
 
 
 class FeedEnv(SessionEnv):
     r"""The paper's second formulation: queries stream by, ask or skip (section 3.4).
 
-    State: the belief and the offered query. Action: 1 asks, 0 skips. Reward: the information gain
-    r in bits of the offered query when it is asked, -r (the regret) when it is skipped. The episode
-    ends at H asked queries and is truncated at O offered ones.
+    State: the belief and the offered query. Action: 1 asks, 0 skips. The episode ends at H asked
+    queries and is truncated at O offered ones. Reward, by ``skip``: with ``regret``, the paper's,
+    asking is worth what the offer is expected to add to the objective, r, and skipping costs it:
+    -r. With ``free``, asking is worth what the answer does add and skipping is worth nothing: what
+    is scarce is the H asks.
 
     Args:
         pool: the queries, normalised. Offers are drawn from it independently and uniformly.
         human: who answers.
         belief: how answers become a belief.
         budget: H, queries asked in an episode, at least 1.
-        offers: O, at least H. None is the paper's 2H.
+        offers: O, at least H. None is the paper's 2H with ``regret`` and 5H with ``free``.
         on_skip: ``new`` offers another query after a skip; ``repeat`` is the paper's literal
             s' = s and offers the same one again.
+        skip: ``regret`` or ``free``.
+        objective: a name of ``objectives.OBJECTIVES``; the default is the paper's.
         batch_size: (B,), sessions that run side by side.
         seed: seeds the environment's own generator; the global generators are never used.
         device: where the tensors live.
 
     Raises:
-        InputError: a number is below its minimum, or ``on_skip`` is another word.
+        InputError: a number is below its minimum, or ``on_skip`` or ``skip`` is another word.
     """
 
     _state_keys = ("human", "samples", "history", "n_asked", "metrics", "offers", "n_offered")
@@ -305,12 +317,15 @@ class FeedEnv(SessionEnv):
         budget: int = 20,
         offers: int | None = None,
         on_skip: str = "new",
+        skip: str = "regret",
+        objective: str = "information_gain",
         batch_size: tuple[int, ...] = (64,),
         seed: int = 0,
         device: torch.device | str = "cpu",
     ) -> None:
-        super().__init__(pool, human, belief, budget, batch_size, seed, device)
-        self.n_offers = 2 * budget
+        super().__init__(pool, human, belief, budget, objective, batch_size, seed, device)
+        self.skip = check_choice("skip", skip, ("regret", "free"))
+        self.n_offers = (2 if skip == "regret" else 5) * budget
         if offers is not None:
             self.n_offers = check_count("setup.offers", offers, budget)
         self.on_skip = check_choice("setup.on_skip", on_skip, ("new", "repeat"))
@@ -345,7 +360,13 @@ class FeedEnv(SessionEnv):
         gain = self._information(tensordict, index) * going_on
         state = self._ask(tensordict, index, gain, (asks & going_on).squeeze(-1))
         state["n_offered"] += going_on
-        reward = torch.where(asks, gain, -gain)
+        state = self._observe(state)
+        if self.skip == "free":
+            reward = self._objective.potential(state) - self._objective.potential(tensordict)
+        else:
+            query, model = self.features[index].unsqueeze(1), self.belief.response_model
+            worth = self._objective.forecast(tensordict, query, model) * going_on
+            reward = torch.where(asks, worth, -worth)
         return self._finish(state, reward, truncated=state["n_offered"] >= self.n_offers)
 
 

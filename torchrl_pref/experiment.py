@@ -18,7 +18,7 @@ from torchrl_pref.envs import FeedEnv, QueryEnv
 from torchrl_pref.errors import InputError, check_choice, check_positive, check_seed
 from torchrl_pref.features import Normalizer
 from torchrl_pref.humans import SimulatedHuman
-from torchrl_pref.policies import Policy, paper_policy, scorer_policy
+from torchrl_pref.policies import Policy, attention_policy, paper_policy, scorer_policy
 from torchrl_pref.queries import QueryPool, gridworld_pool
 from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel, calibrate_tau
 from torchrl_pref.training import A2CSettings, Trainer
@@ -160,16 +160,18 @@ def make_feed_env(
     """The feed environment on a normalised pool, by the sections ``setup`` and ``belief``."""
     setup = settings["setup"]
     common = _session_arguments(settings, task, sessions, seed)
-    return FeedEnv(pool, offers=setup["offers"], on_skip=setup["on_skip"], **common)
+    kinds = {"on_skip": setup["on_skip"], "skip": settings["skip"]}
+    return FeedEnv(pool, offers=setup["offers"], **kinds, **common)
 
 
 def _session_arguments(settings: Settings, task: Task, sessions: int, seed: int) -> dict[str, Any]:
     """What both environments are made with."""
     belief = settings["belief"]
     return {
-        "human": SimulatedHuman(task.response_model),
+        "human": SimulatedHuman(task.response_model, settings["tau_spread"]),
         "belief": Belief(task.response_model, belief["samples"], belief["moves"]),
         "budget": settings["setup"]["budget"],
+        "objective": settings["objective"],
         "batch_size": (sessions,),
         "seed": seed,
         "device": check_device(settings["device"]),
@@ -199,7 +201,10 @@ def make_trainer(settings: Settings, task: Task) -> Trainer:
 
 def make_policy(settings: Settings, env: QueryEnv | FeedEnv) -> Policy:
     """The policy of the setting ``policy``, untrained, to fit an environment."""
-    name = check_choice("policy", settings["policy"]["name"], ("scorer", "paper"))
+    chosen = settings["policy"]
+    name = check_choice("policy", chosen["name"], ("scorer", "attention", "paper"))
+    if name == "attention":
+        return attention_policy(env, chosen["tokens"])
     return paper_policy(env) if name == "paper" else scorer_policy(env)
 
 
@@ -215,7 +220,7 @@ def make_checkpoint(settings: Settings, task: Task, trainer: Trainer) -> Checkpo
         train_digest=train.digest,
         test_digest=task.test.digest,
         pool_shape=shape,
-        weights=trainer.policy.weights.state_dict(),
+        weights=trainer.average,
         training=trainer.state_dict(),
     )
 

@@ -5,6 +5,7 @@ Shapes: ``…`` any leading dimensions (queries, options), T trajectory length, 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -96,3 +97,23 @@ class Normalizer:
                 "training pool; use the feature map that the training pool was made with"
             )
         return (features - self.mean) / self.std
+
+
+def balance(features: Tensor) -> Callable[[Tensor], Tensor]:
+    """A linear map after which a pool's options differ equally in every direction.
+
+    Some directions of ω show in hardly any query of a pool. After this map, fitted on the pool's
+    features (N K D), the options of a query differ by the same variance in all D directions.
+
+    Raises:
+        InputError: the options do not differ in some direction at all.
+    """
+    gaps = (features - features.mean(1, keepdim=True)).flatten(0, 1).double()
+    variances, directions = torch.linalg.eigh(gaps.mT @ gaps / len(gaps))
+    if variances[0] <= 1e-10 * variances[-1]:
+        raise InputError(
+            "features cannot be balanced: the options of a query never differ in some direction; "
+            "expected D linearly independent features; drop those that follow from the others"
+        )
+    matrix = (directions / variances.sqrt()) @ directions.mT
+    return lambda raw: raw @ matrix.to(raw)

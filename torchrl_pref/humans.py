@@ -10,6 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Generator, Tensor
 
 from torchrl_pref.belief import uniform_sphere
+from torchrl_pref.errors import InputError, check_positive
 from torchrl_pref.responses import ResponseModel
 
 
@@ -21,32 +22,43 @@ class SimulatedHuman:
 
     Args:
         response_model: how the human answers.
+        spread: humans differ in how careful they are: each one's returns are multiplied by a factor
+            drawn log-uniformly between 1/spread and spread, which a strategy is not told. 1 makes
+            them all alike.
+
+    Raises:
+        InputError: ``spread`` is not a finite number of at least 1.
     """
 
-    def __init__(self, response_model: ResponseModel) -> None:
+    def __init__(self, response_model: ResponseModel, spread: float = 1.0) -> None:
         self.response_model = response_model
+        self.spread = check_positive("spread", spread)
+        if spread < 1:
+            raise InputError(f"spread={spread}: expected a factor of at least 1; 1 is no spread")
 
     def draw(
         self, n_sessions: int, budget: int, n_options: int, n_features: int, generator: Generator
     ) -> TensorDict:
-        """Draw B humans: ``omega`` (B D) and ``noise`` (B H R), standard Gumbel."""
+        """Draw B humans: ``omega`` (B D), standard Gumbel ``noise`` (B H R), ``care`` (B 1)."""
         omega = uniform_sphere((n_sessions, n_features), generator)
         shape = (n_sessions, budget, n_options)
         exponential = torch.empty(shape, device=generator.device).exponential_(generator=generator)
         noise = -exponential.clamp(min=1e-30).log()
-        return TensorDict({"omega": omega, "noise": noise}, [n_sessions], device=generator.device)
+        exponent = 2 * torch.rand((n_sessions, 1), generator=generator, device=generator.device) - 1
+        human = {"omega": omega, "noise": noise, "care": self.spread**exponent}
+        return TensorDict(human, [n_sessions], device=generator.device)
 
     def respond(self, queries: Tensor, human: TensorDictBase, turn: Tensor) -> Tensor:
         """Pick one option of a query, by the Gumbel-max trick.
 
         Args:
             queries: (B K D), features of the options.
-            human: ``omega`` and ``noise`` as drawn.
+            human: as drawn.
             turn: (B), how many queries each human has answered before.
 
         Returns:
             (B) int64, the index of the chosen option.
         """
-        returns = (queries @ human["omega"].unsqueeze(-1)).squeeze(-1)
+        returns = (queries @ human["omega"].unsqueeze(-1)).squeeze(-1) * human["care"]
         noise = torch.take_along_dim(human["noise"], turn[:, None, None], 1).squeeze(1)
         return (self.response_model(returns) + noise).argmax(-1)

@@ -93,7 +93,8 @@ class ResponseModel(ABC):
             leads: (… M K-1), by how much the return of each option exceeds that of the last one,
                 under each sample.
         """
-        log_probs = self(F.pad(leads, (0, 1)))
+        columns = leads.unbind(-1)
+        log_probs = self(torch.stack([*columns, torch.zeros_like(columns[0])]).movedim(0, -1))
         probs = log_probs.exp()
         # The clamp keeps 0 · log 0 from being NaN; it changes no product that float32 can hold.
         entropy = -(probs * log_probs.clamp(min=-1e4)).mean(-2).sum(-1)
@@ -141,7 +142,7 @@ class Boltzmann(ResponseModel):
         if returns.shape[-1] == 2:
             return super().__call__(returns)
         # The same for all K options at once, in K exponentials and not K².
-        return torch.log_softmax(self.tau * returns, -1)
+        return torch.log_softmax(self.tau * returns.movedim(-1, 0), 0).movedim(0, -1)
 
     def predict(self, leads: Tensor) -> Prediction:
         """See :meth:`ResponseModel.predict`."""
@@ -205,7 +206,9 @@ def sum_of_logs(probs: Tensor) -> Tensor:
     Returns:
         (…).
     """
-    return torch.stack([part.prod(-1) for part in probs.split(64, -1)]).log().sum(0)
+    whole = probs.shape[-1] // 64 * 64
+    products = probs[..., :whole].unflatten(-1, (-1, 64)).prod(-1)
+    return products.log().sum(-1) + probs[..., whole:].prod(-1).log()
 
 
 def calibrate_tau(returns: Tensor, target: float = 0.9) -> float:

@@ -17,7 +17,7 @@ from torch.nn import functional as F
 
 from torchrl_pref.responses import ResponseModel
 
-MAX_SHRINKS = 20
+MAX_SHRINKS = 12
 """Shrinks of a bracket before a sample stays where it is. The same shrinks lead back from where it
 would have gone, so that giving up leaves the posterior invariant too."""
 

@@ -13,11 +13,21 @@ import math
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Generator
+from torch import Generator, Tensor
 
-from torchrl_pref.acquisition import Acquisition, information_gain, score_queries
-from torchrl_pref.errors import check_share
+from torchrl_pref.acquisition import (
+    Acquisition,
+    information_gain,
+    predict_answers,
+    rank_offer,
+    score_queries,
+)
+from torchrl_pref.envs import FeedEnv
+from torchrl_pref.errors import check_count, check_share
 from torchrl_pref.responses import ResponseModel
+
+REFERENCE = 100
+"""Queries of the pool among which a feed strategy ranks an offer."""
 
 
 class RandomQuery(TensorDictModuleBase):
@@ -70,6 +80,49 @@ class Greedy(TensorDictModuleBase):
         return tensordict.set("action", allowed.argmax(-1))
 
 
+class Lookahead(TensorDictModuleBase):
+    """Ask the candidate whose information gain and best successor's sum to most: two steps ahead.
+
+    The belief after each answer to the first query is the present one reweighted, so that all
+    second steps are matrix products. Only the ``beam`` best first steps are followed.
+
+    Args:
+        response_model: how the belief thinks the human answers.
+        beam: first steps to follow.
+    """
+
+    in_keys = ["samples", "queries", "action_mask"]
+    out_keys = ["action"]
+
+    def __init__(self, response_model: ResponseModel, beam: int = 20) -> None:
+        super().__init__()
+        self.response_model = response_model
+        self.beam = check_count("beam", beam, 1)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action`` (B)."""
+        # One session at a time: the table of all second steps is large.
+        actions = [self._choose(session) for session in tensordict.select(*self.in_keys).unbind(0)]
+        return tensordict.set("action", torch.stack(actions))
+
+    def _choose(self, session: TensorDictBase) -> Tensor:
+        samples = session["samples"].unsqueeze(0)
+        predicted = predict_answers(samples, session["queries"].unsqueeze(0), self.response_model)
+        gain = information_gain(predicted, samples)[0]
+        gain = gain.masked_fill(~session["action_mask"], -math.inf)
+        probs = predicted.probs[0]  # (C M R)
+        entropy = torch.special.entr(probs).sum(-1)
+        value, first = gain.topk(min(self.beam, len(gain)))
+        joint = probs[first].mT / probs.shape[1]  # (beam R M): P(answer and sample)
+        of_answer = joint.sum(-1, keepdim=True)
+        weights = joint / of_answer.clamp(min=1e-30)
+        later = torch.stack([weights @ answer.T for answer in probs.unbind(-1)])
+        # (beam R C), information gain of every second query after every first answer
+        second = torch.special.entr(later).sum(0) - weights @ entropy.T
+        best = second.amax(-1) / math.log(2)
+        return first[(value + (of_answer.squeeze(-1) * best).sum(-1)).argmax()]
+
+
 class RandomAsk(TensorDictModuleBase):
     """Ask each offer with a fixed probability; 1 asks everything.
 
@@ -94,3 +147,68 @@ class RandomAsk(TensorDictModuleBase):
         offer = tensordict["offer"]
         uniform = torch.rand(offer.shape[:-2], generator=self.generator).to(offer.device)
         return tensordict.set("action", (uniform < self.probability).long())
+
+
+class ThresholdAsk(TensorDictModuleBase):
+    """Ask an offer of at least a fixed acquisition value, or when all that are left must be asked.
+
+    Args:
+        env: gives the response model and the budgets.
+        threshold: in the units of the acquisition function.
+        acquisition: the value of an offer; information gain by default.
+    """
+
+    in_keys = ["samples", "offer", "n_asked", "n_offered"]
+    out_keys = ["action"]
+
+    def __init__(
+        self, env: FeedEnv, threshold: float, acquisition: Acquisition = information_gain
+    ) -> None:
+        super().__init__()
+        self.response_model, self.acquisition = env.belief.response_model, acquisition
+        self.budget, self.n_offers, self.threshold = env.budget, env.n_offers, threshold
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action`` (B)."""
+        samples, offer, n_asked, n_offered = (tensordict[key] for key in self.in_keys)
+        predicted = predict_answers(samples, offer.unsqueeze(1), self.response_model)
+        value = self.acquisition(predicted, samples)
+        share = asks_over_offers(n_asked, n_offered, self.budget, self.n_offers)
+        ask = (value >= self.threshold) | (share >= 1)
+        return tensordict.set("action", ask.squeeze(-1).long())
+
+
+class QuantileAsk(TensorDictModuleBase):
+    """Ask an offer that ranks among the best asks-left-over-offers-left of what may be offered.
+
+    Args:
+        env: gives the response model, the pool and the budgets.
+        acquisition: the value of an offer; information gain by default.
+    """
+
+    in_keys = ["samples", "offer", "n_asked", "n_offered"]
+    out_keys = ["action"]
+
+    def __init__(self, env: FeedEnv, acquisition: Acquisition = information_gain) -> None:
+        super().__init__()
+        self.response_model, self.acquisition = env.belief.response_model, acquisition
+        self.budget, self.n_offers, self.reference = env.budget, env.n_offers, reference_of(env)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action`` (B)."""
+        samples, offer, n_asked, n_offered = (tensordict[key] for key in self.in_keys)
+        rank = rank_offer(samples, offer, self.reference, self.response_model, self.acquisition)
+        share = asks_over_offers(n_asked, n_offered, self.budget, self.n_offers)
+        return tensordict.set("action", (rank >= 1 - share.squeeze(-1)).long())
+
+
+def reference_of(env: FeedEnv) -> Tensor:
+    """A sample (N K D) of what the environment may offer, spread evenly over its pool."""
+    features = env.features
+    places = torch.linspace(0, len(features) - 1, min(REFERENCE, len(features)))
+    return features[places.long().to(features.device)]
+
+
+def asks_over_offers(n_asked: Tensor, n_offered: Tensor, budget: int, n_offers: int) -> Tensor:
+    """Asks left over offers left, at most 1, from counts (B 1)."""
+    return ((budget - n_asked) / (n_offers - n_offered).clamp(min=1)).clamp(max=1)

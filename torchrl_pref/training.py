@@ -54,6 +54,8 @@ class A2CSettings:
         entropy: coefficient of the entropy bonus.
         critic: coefficient of the critic's squared error.
         grad_norm: the gradient is clipped to this length.
+        average: share of the old that the moving average of the weights keeps at each update; the
+            average is what is saved and evaluated, as it is steadier. 0 averages nothing.
         save_every: updates between two checkpoints.
 
     Raises:
@@ -70,6 +72,7 @@ class A2CSettings:
     entropy: float
     critic: float
     grad_norm: float
+    average: float
     save_every: int
 
     def __post_init__(self) -> None:
@@ -77,7 +80,7 @@ class A2CSettings:
             check_count(f"training.{name}", getattr(self, name), 1)
         for name in ("learning_rate", "critic", "grad_norm"):
             check_positive(f"training.{name}", getattr(self, name))
-        for name in ("gamma", "lmbda", "entropy"):
+        for name in ("gamma", "lmbda", "entropy", "average"):
             check_share(f"training.{name}", getattr(self, name))
         check_choice("training.optimizer", self.optimizer, ("adam", "rmsprop"))
 
@@ -113,6 +116,7 @@ class Trainer:
         torch.manual_seed(seed)
         self.env, self.policy, self.settings = env, policy, settings
         self.progress = Progress()
+        self.start_average()
         self.advantage = GAE(
             gamma=settings.gamma,
             lmbda=settings.lmbda,
@@ -187,12 +191,20 @@ class Trainer:
         total.backward()
         clip_grad_norm_(self.loss.parameters(), self.settings.grad_norm)
         self.optimizer.step()
+        for name, weight in self.policy.weights.state_dict().items():
+            self.average[name].lerp_(weight, 1 - self.settings.average)
+
+    def start_average(self) -> None:
+        """Begin the average of the weights with what the policy holds now."""
+        weights = self.policy.weights.state_dict()
+        self.average = {name: weight.clone() for name, weight in weights.items()}
 
     def state_dict(self) -> dict[str, Any]:
         """Plain data and tensors that :meth:`load_state_dict` goes on from, bit for bit."""
         # TorchRL's collector state holds no environment state; ours is all in its carrier.
         return {
             "update": self.progress.update,
+            "weights": self.policy.weights.state_dict(),
             "history": self.progress.history,
             "optimizer": self.optimizer.state_dict(),
             "sessions": self.collector._carrier.to_dict(),
@@ -201,7 +213,9 @@ class Trainer:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on where :meth:`state_dict` was taken; the policy's weights are loaded apart."""
+        """Go on where :meth:`state_dict` was taken; the average is what the policy holds now."""
+        self.start_average()
+        self.policy.weights.load_state_dict(state["weights"])
         self.progress = Progress(state["update"], state["history"])
         self.optimizer.load_state_dict(state["optimizer"])
         sessions = TensorDict(state["sessions"], self.env.batch_size, device=self.env.device)

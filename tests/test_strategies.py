@@ -1,0 +1,111 @@
+import math
+
+import pytest
+import torch
+from conftest import RESPONSE_MODELS
+from test_envs import make
+from test_policies import session_of
+from torch import Generator
+
+from torchrl_pref.acquisition import (
+    expected_alignment,
+    information_gain,
+    predict_answers,
+    rank_offer,
+)
+from torchrl_pref.envs import FeedEnv, QueryEnv
+from torchrl_pref.errors import InputError
+from torchrl_pref.queries import QueryPool
+from torchrl_pref.responses import ResponseModel
+from torchrl_pref.strategies import (
+    Greedy,
+    Lookahead,
+    QuantileAsk,
+    RandomAsk,
+    RandomQuery,
+    ThresholdAsk,
+)
+
+
+def test_random_strategies_have_their_own_seeded_luck(pool: QueryPool) -> None:
+    session = session_of(make(QueryEnv, pool, batch=2000))
+    session["action_mask"][:, 5:] = False
+    actions = RandomQuery(1)(session)["action"]
+    assert actions.bincount(minlength=5).tolist() == pytest.approx([400] * 5, abs=5 * 18)
+    assert torch.equal(actions, RandomQuery(1)(session)["action"])
+    offers = session_of(make(FeedEnv, pool, batch=2000))
+    assert float(RandomAsk(0.3)(offers)["action"].float().mean()) == pytest.approx(0.3, abs=0.05)
+    assert (RandomAsk(1.0)(offers)["action"] == 1).all()
+    with pytest.raises(InputError, match="probability=2"):
+        RandomAsk(2)
+
+
+def test_greedy_obeys_the_mask(pool: QueryPool) -> None:
+    env = make(QueryEnv, pool, repeats=False)
+    greedy = Greedy(RESPONSE_MODELS[0])
+    asked = env.rollout(5, greedy)["next", "history", "queries"][:, -1]
+    assert all(len(row.unique()) == 5 for row in asked)
+
+
+def weighted_gain(probs: torch.Tensor, weights: torch.Tensor) -> float:
+    """Information gain in bits of one query, probs (M R), under weighted samples (M)."""
+    weights = weights / weights.sum()
+    mean = (weights[:, None] * probs).sum(0)
+    entropy = sum(-float(p) * math.log2(p) for p in mean if p > 0)
+    for row, weight in zip(probs, weights, strict=True):
+        entropy += float(weight) * sum(float(p) * math.log2(p) for p in row if p > 0)
+    return entropy
+
+
+@pytest.mark.parametrize("options", [2, 3])
+@pytest.mark.parametrize("model", RESPONSE_MODELS, ids=str)
+def test_lookahead_agrees_with_brute_force(
+    model: ResponseModel, options: int, generator: Generator
+) -> None:
+    pool = QueryPool(torch.randn(8, options, 4, generator=generator))
+    env = make(QueryEnv, pool, model, batch=5)
+    session = session_of(env)
+    chosen = Lookahead(model, beam=8)(session.clone())["action"]
+    for b in range(5):
+        samples, queries = session["samples"][b : b + 1], session["queries"][b : b + 1]
+        probs = predict_answers(samples, queries, model).probs[0].double()
+        values = []
+        for first in probs:
+            value = weighted_gain(first, torch.ones(20))
+            for answer in first.unbind(-1):
+                if answer.sum() > 0:
+                    best = max(weighted_gain(second, answer) for second in probs)
+                    value += float(answer.mean()) * best
+            values.append(value)
+        assert values[int(chosen[b])] == pytest.approx(max(values), abs=1e-4)
+
+
+def test_threshold_asks_above_it_and_at_the_end(pool: QueryPool) -> None:
+    env = make(FeedEnv, pool, batch=30, skip="free")
+    nothing = env.rollout(25, ThresholdAsk(env, 9.0))
+    # 25 offers, 5 asks, no offer is worth 9 bits: the last five are asked.
+    assert (nothing["action"][:, :20] == 0).all()
+    assert (nothing["action"][:, 20:] == 1).all()
+    data = env.rollout(5, ThresholdAsk(env, 0.2))
+    for step in range(5):
+        samples, offer = data["samples"][:, step], data["offer"][:, step]
+        predicted = predict_answers(samples, offer.unsqueeze(1), env.belief.response_model)
+        asks = information_gain(predicted, samples).squeeze(-1) >= 0.2
+        assert torch.equal(data["action"][:, step] == 1, asks)
+
+
+@pytest.mark.parametrize("acquisition", [information_gain, expected_alignment])
+def test_quantile_rule_uses_up_its_asks_on_the_best(acquisition: object, pool: QueryPool) -> None:
+    env = make(FeedEnv, pool, batch=40, skip="free")
+    data = env.rollout(25, QuantileAsk(env, acquisition), break_when_any_done=False)  # type: ignore[arg-type]
+    first = data[:, 0]
+    rank = rank_offer(
+        first["samples"],
+        first["offer"],
+        pool.features,
+        env.belief.response_model,
+        acquisition,  # type: ignore[arg-type]
+    )
+    assert torch.equal(first["action"] == 1, rank >= 1 - 5 / 25)
+    asked = data["next", "n_asked"].squeeze(-1).amax(1)
+    assert (asked == 5).all()

@@ -1,0 +1,48 @@
+"""Policies that come with the package, trained for each setup and kind of human.
+
+``torchrl_pref/pretrained/README.md`` is their card: how they were trained, and how they do.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from torchrl_pref.checkpoint import Checkpoint
+from torchrl_pref.envs import FeedEnv, QueryEnv
+from torchrl_pref.errors import check_choice, check_count
+from torchrl_pref.policies import Policy, scorer_policy
+
+FOLDER = Path(__file__).parent / "pretrained"
+
+SEEDS = 5
+
+
+def pretrained_checkpoint(setup: str, tau: str, seed: int = 0) -> Checkpoint:
+    """One of the policies that come with the package.
+
+    Args:
+        setup: ``query`` or ``feed``.
+        tau: ``noisy`` or ``optimal``, the human it was trained with.
+        seed: of its training, 0 to 4.
+
+    Raises:
+        InputError: there is no such policy.
+    """
+    check_choice("setup", setup, ("query", "feed"))
+    check_choice("tau", tau, ("noisy", "optimal"))
+    check_count("seed", seed, 0)
+    return Checkpoint.load(FOLDER / f"{setup}-{tau}-{seed}.pt")
+
+
+def pretrained_policy(env: QueryEnv | FeedEnv, tau: str, seed: int = 0) -> Policy:
+    """A trained scorer for an environment: any pool, any number of options and features.
+
+    Args:
+        env: where it is to ask, made with ``objective="alignment"``; a feed with ``skip="free"``.
+        tau: ``noisy`` or ``optimal``, the human it was trained with.
+        seed: of its training, 0 to 4.
+    """
+    setup = "feed" if isinstance(env, FeedEnv) else "query"
+    policy = scorer_policy(env)
+    policy.weights.load_state_dict(pretrained_checkpoint(setup, tau, seed).weights)
+    return policy

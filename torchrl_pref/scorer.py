@@ -1,0 +1,173 @@
+"""The scorer: what it sees of each candidate and of the belief, and the networks on top.
+
+Shapes: B sessions, C candidates, M belief samples, K options per query, D features,
+F features of a candidate, G features of the belief.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torchrl.modules import MLP
+
+from torchrl_pref.acquisition import (
+    expected_alignment,
+    information_gain,
+    rank_offer,
+    score_queries,
+    volume_removal,
+)
+from torchrl_pref.belief import covariance_of
+from torchrl_pref.envs import FeedEnv
+from torchrl_pref.responses import Prediction, ResponseModel
+from torchrl_pref.strategies import REFERENCE, asks_over_offers, reference_of
+
+N_CANDIDATE = 7
+"""F, see :class:`CandidateFeatures`."""
+
+N_BELIEF = 4
+"""G less the shares that remain, see :class:`BeliefFeatures`."""
+
+QUERY_SCALE, FEED_SCALE = 8.0, 30.0
+"""Logits per standard deviation of the greedy score, and per unit of rank, before training."""
+
+
+class CandidateFeatures(nn.Module):
+    """What the belief knows about each candidate, whichever option is listed first.
+
+    Information gain (bits), expected gain in alignment, volume removal, standard deviation and
+    variance under the belief of how the options' returns differ, how the mean belief tells them
+    apart, and how their features differ. Nothing depends on D, on C or on the order of the options.
+
+    Args:
+        response_model: how the belief thinks the human answers.
+    """
+
+    def __init__(self, response_model: ResponseModel) -> None:
+        super().__init__()
+        self.response_model = response_model
+
+    def forward(self, samples: Tensor, queries: Tensor) -> Tensor:
+        """From samples (B M D) and candidates (B C K D) to features (B C F)."""
+        mean = samples.mean(1)
+        gain, alignment, removal = score_queries(
+            samples, queries, self.response_model, _all_acquisitions
+        ).unbind(-1)
+        centred = queries - queries.mean(-2, keepdim=True)
+        covariance = covariance_of(samples)
+        variance = ((centred @ covariance.unsqueeze(1)) * centred).sum((-2, -1))
+        apart = (centred @ mean[:, None, :, None]).squeeze(-1).norm(dim=-1)
+        now = mean.square().sum(-1, keepdim=True)
+        length = centred.square().sum((-2, -1)).sqrt()
+        return torch.stack(
+            [gain, alignment - now, removal, variance.sqrt(), variance, apart, length], -1
+        )
+
+
+def _all_acquisitions(predicted: Prediction, samples: Tensor) -> Tensor:
+    """Information gain, expected alignment and volume removal, (B C 3)."""
+    functions = (information_gain, expected_alignment, volume_removal)
+    return torch.stack([function(predicted, samples) for function in functions], -1)
+
+
+def _gains(predicted: Prediction, samples: Tensor) -> Tensor:
+    """Information gain and expected alignment, (B C 2)."""
+    return _all_acquisitions(predicted, samples)[..., :2]
+
+
+def greedy_feature(objective: str) -> int:
+    """Which candidate feature is the objective's forecast: the score of its greedy strategy."""
+    return 1 if objective in ("alignment", "true_alignment") else 0
+
+
+class BeliefFeatures(nn.Module):
+    """How far the session is and how sure the belief: the shares of asks (and offers) left, the
+    length of the mean, and the log of the largest, mean and smallest variance of the samples."""
+
+    def forward(self, samples: Tensor, remaining: Tensor) -> Tensor:
+        """From samples (B M D) and shares (B 1 or 2) to features (B G)."""
+        # Far below any spread of samples on the sphere, far above the rounding of float32.
+        variances = torch.linalg.eigvalsh(covariance_of(samples)).clamp(min=1e-8)
+        summary = [variances[..., -1], variances.mean(-1), variances[..., 0]]
+        logs = torch.stack(summary, -1).log() / 4
+        return torch.cat([remaining, samples.mean(-2).norm(dim=-1, keepdim=True), logs], -1)
+
+
+class QueryScorer(nn.Module):
+    """One logit per candidate: scale · (greedy score + learned correction).
+
+    The greedy score is the objective's forecast in standard deviations over the candidates, so that
+    one scale serves any objective, noise and stage. The correction is zero at the start: training
+    starts from the objective's greedy strategy with a little exploration, not from nothing.
+    """
+
+    def __init__(self, greedy: int, n_remaining: int, device: torch.device) -> None:
+        super().__init__()
+        self.greedy = greedy
+        self.log_scale = nn.Parameter(torch.tensor(math.log(QUERY_SCALE), device=device))
+        self.network = _zero_headed_mlp(2 * N_CANDIDATE + N_BELIEF + n_remaining, device)
+
+    def forward(self, candidates: Tensor, belief: Tensor) -> Tensor:
+        """From candidate features (B C F) and belief features (B G) to logits (B C)."""
+        centred = candidates - candidates.mean(-2, keepdim=True)
+        standard = centred / centred.square().mean(-2, keepdim=True).sqrt().clamp(min=1e-6)
+        belief = belief.unsqueeze(-2).expand(*candidates.shape[:-1], -1)
+        correction = self.network(torch.cat([candidates, standard, belief], -1)).squeeze(-1)
+        return self.log_scale.exp() * (standard[..., self.greedy] + correction)
+
+
+class OfferScorer(nn.Module):
+    """The logits of skip and ask for one offer, started at the budget-aware quantile rule.
+
+    That rule asks if the offer's forecast ranks among the best share of a reference sample of the
+    pool, the share being asks left over offers left. The correction is zero at the start.
+    """
+
+    def __init__(self, greedy: int, n_remaining: int, device: torch.device) -> None:
+        super().__init__()
+        self.greedy = greedy
+        self.log_scale = nn.Parameter(torch.tensor(math.log(FEED_SCALE), device=device))
+        self.network = _zero_headed_mlp(N_CANDIDATE + 2 + 1 + N_BELIEF + n_remaining, device)
+
+    def forward(self, offer: Tensor, ranks: Tensor, share: Tensor, belief: Tensor) -> Tensor:
+        """From offer features (B F), ranks of both gains (B 2), share (B 1) and belief features
+        (B G) to logits (B 2)."""
+        # Half a rank breaks ties in favour of asking; at a share of 1 all that are left are asked.
+        margin = ranks[..., self.greedy, None] - (1 - share) + 0.5 / REFERENCE + (share >= 1)
+        correction = self.network(torch.cat([offer, ranks, share, belief], -1))
+        ask = self.log_scale.exp() * (margin + correction)
+        return torch.cat([torch.zeros_like(ask), ask], -1)
+
+
+class OfferFeatures(nn.Module):
+    """The features of the one offered query, and its ranks among a reference sample of the pool.
+
+    Args:
+        env: gives the response model, the pool and the budgets.
+    """
+
+    def __init__(self, env: FeedEnv) -> None:
+        super().__init__()
+        self.features = CandidateFeatures(env.belief.response_model)
+        self.budget, self.n_offers = env.budget, env.n_offers
+        self.reference = reference_of(env)
+
+    def forward(
+        self, samples: Tensor, offer: Tensor, n_asked: Tensor, n_offered: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """From samples (B M D), offer (B K D) and counts (B 1) to offer features (B F), ranks of
+        information and alignment gain (B 2), and asks left over offers left (B 1)."""
+        model = self.features.response_model
+        ranks = rank_offer(samples, offer, self.reference, model, _gains)
+        share = asks_over_offers(n_asked, n_offered, self.budget, self.n_offers)
+        return self.features(samples, offer.unsqueeze(1)).squeeze(1), ranks, share
+
+
+def _zero_headed_mlp(n_inputs: int, device: torch.device) -> MLP:
+    """A small perceptron whose output is zero until it learns."""
+    network = MLP(n_inputs, 1, num_cells=[32, 32], activation_class=nn.Tanh, device=device)
+    nn.init.zeros_(network[-1].weight)
+    nn.init.zeros_(network[-1].bias)
+    return network

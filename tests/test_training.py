@@ -28,11 +28,14 @@ def settings_of(setup: str = "feed", policy: str = "scorer", **training: Any) ->
         "tau": "noisy",
         "seed": 0,
         "device": "cpu",
+        "objective": "alignment",
+        "skip": "free",
+        "tau_spread": 1,
         "grid": {"size": 8, "length": 20},
         "pool": {"size": 30, "options": 2, "seed": 0, "train": None, "test": None},
         "belief": {"samples": 10, "moves": 1},
         "evaluation": {"humans": 5, "seed": 1},
-        "policy": {"name": policy, "sample": False},
+        "policy": {"name": policy, "sample": False, "start": None, "tokens": "samples"},
         "setup": {
             "name": setup,
             "budget": 4,
@@ -53,6 +56,7 @@ def settings_of(setup: str = "feed", policy: str = "scorer", **training: Any) ->
             "entropy": 0.01,
             "critic": 0.5,
             "grad_norm": 0.5,
+            "warm_up": 1,
             "average": 0.9,
             "save_every": 2,
             **training,
@@ -77,7 +81,7 @@ def same(first: Any, second: Any) -> bool:
 
 
 @pytest.mark.parametrize("setup", ["query", "feed"])
-@pytest.mark.parametrize("policy", ["scorer", "paper"])
+@pytest.mark.parametrize("policy", ["scorer", "attention", "paper"])
 def test_resumed_run_equals_an_uninterrupted_one_bit_for_bit(
     setup: str, policy: str, tmp_path: Path
 ) -> None:

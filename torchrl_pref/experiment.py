@@ -205,7 +205,7 @@ def make_policy(settings: Settings, env: QueryEnv | FeedEnv) -> Policy:
     name = check_choice("policy", chosen["name"], ("scorer", "attention", "paper"))
     if name == "attention":
         return attention_policy(env, chosen["tokens"])
-    return paper_policy(env) if name == "paper" else scorer_policy(env)
+    return paper_policy(env) if name == "paper" else scorer_policy(env, chosen["start"])
 
 
 def make_checkpoint(settings: Settings, task: Task, trainer: Trainer) -> Checkpoint:

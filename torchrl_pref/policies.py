@@ -56,14 +56,15 @@ class Policy:
         return nn.ModuleDict({"actor": self.actor, "critic": self.critic})
 
 
-def scorer_policy(env: QueryEnv | FeedEnv) -> Policy:
+def scorer_policy(env: QueryEnv | FeedEnv, start: str | None = None) -> Policy:
     """The default policy: a shared network scores each candidate, so any pool of any size will do.
 
     Args:
         env: gives the response model of the belief, the objective and the kind of decision.
+        start: the objective whose greedy strategy it starts from; by default the environment's own.
     """
     device = torch.device(env.device)
-    greedy = greedy_feature(env.objective)
+    greedy = greedy_feature(env.objective if start is None else start)
     n_shares = env.observation_spec["remaining"].shape[-1]
     if isinstance(env, QueryEnv):
         features = TensorDictModule(

@@ -21,6 +21,8 @@ from torchrl_pref.acquisition import (
 )
 from torchrl_pref.belief import covariance_of
 from torchrl_pref.envs import FeedEnv
+from torchrl_pref.errors import check_choice
+from torchrl_pref.objectives import OBJECTIVES
 from torchrl_pref.responses import Prediction, ResponseModel
 from torchrl_pref.strategies import REFERENCE, asks_over_offers, reference_of
 
@@ -78,7 +80,12 @@ def _gains(predicted: Prediction, samples: Tensor) -> Tensor:
 
 
 def greedy_feature(objective: str) -> int:
-    """Which candidate feature is the objective's forecast: the score of its greedy strategy."""
+    """Which candidate feature is the objective's forecast: the score of its greedy strategy.
+
+    Raises:
+        InputError: there is no such objective.
+    """
+    check_choice("policy.start", objective, tuple(OBJECTIVES))
     return 1 if objective in ("alignment", "true_alignment") else 0
 
 
@@ -167,7 +174,7 @@ class OfferFeatures(nn.Module):
 
 def _zero_headed_mlp(n_inputs: int, device: torch.device) -> MLP:
     """A small perceptron whose output is zero until it learns."""
-    network = MLP(n_inputs, 1, num_cells=[32, 32], activation_class=nn.Tanh, device=device)
+    network = MLP(n_inputs, 1, num_cells=[32], activation_class=nn.Tanh, device=device)
     nn.init.zeros_(network[-1].weight)
     nn.init.zeros_(network[-1].bias)
     return network

@@ -54,6 +54,8 @@ class A2CSettings:
         entropy: coefficient of the entropy bonus.
         critic: coefficient of the critic's squared error.
         grad_norm: the gradient is clipped to this length.
+        warm_up: updates, of the first, in which only the critic learns: a policy that starts from a
+            good strategy is not to be judged by a critic that knows nothing.
         average: share of the old that the moving average of the weights keeps at each update; the
             average is what is saved and evaluated, as it is steadier. 0 averages nothing.
         save_every: updates between two checkpoints.
@@ -72,12 +74,14 @@ class A2CSettings:
     entropy: float
     critic: float
     grad_norm: float
+    warm_up: int
     average: float
     save_every: int
 
     def __post_init__(self) -> None:
         for name in ("updates", "sessions", "steps", "save_every"):
             check_count(f"training.{name}", getattr(self, name), 1)
+        check_count("training.warm_up", self.warm_up, 0)
         for name in ("learning_rate", "critic", "grad_norm"):
             check_positive(f"training.{name}", getattr(self, name))
         for name in ("gamma", "lmbda", "entropy", "average"):
@@ -186,7 +190,8 @@ class Trainer:
         with torch.no_grad():
             self.advantage(batch)
         losses = self.loss(batch.reshape(-1))
-        total = sum(value for key, value in losses.items() if key.startswith("loss_"))
+        learning = "loss_critic" if self.progress.update < self.settings.warm_up else "loss_"
+        total = sum(value for key, value in losses.items() if key.startswith(learning))
         self.optimizer.zero_grad()
         total.backward()
         clip_grad_norm_(self.loss.parameters(), self.settings.grad_norm)

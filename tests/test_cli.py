@@ -184,12 +184,18 @@ def test_help_explains_every_key(script: str) -> None:
         with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
             keys |= keys_of(compose(script, [f"setup={setup}"]))
     named = {"setup.name": "setup", "policy.name": "policy", "policy.sample": "policy"}
+    if script == "train":
+        for policy in ("attention", "paper"):
+            with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+                keys |= keys_of(compose(script, [f"policy={policy}"]))
     if script == "evaluate":  # only for training
-        keys -= {"seed", "setup.candidates", "setup.repeats", "setup.on_skip"}
+        keys -= {"objective", "setup.candidates", "setup.repeats", "setup.on_skip"}
     for key in keys:
         assert re.search(rf"\b{re.escape(named.get(key, key))}\b", help_text), key
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
         groups = {"query": compose(script, ["setup=query"]), "feed": compose(script)}
+        if script == "train":
+            groups["attention"] = compose(script, ["policy=attention"])
     for key, value in re.findall(r"^ +([a-z_]+\.[a-z_]+)=(\S+)", help_text, re.M):
         if not key.startswith("hydra."):
             defaults = {str(OmegaConf.select(config, key)).lower() for config in groups.values()}
@@ -229,6 +235,15 @@ BAD_INPUT = [
     ("train", "pool.train={tmp}/plain.pt pool.test={tmp}/wide.pt", "D=5: expected D=4"),
     ("train", "hydra.run.dir={tmp}/text.pt/run", "the run folder cannot be written"),
     ("train", "hydra.run.dir=/sys", "cannot be written"),
+    ("train", "objective=fun", "objective='fun': expected one of information_gain, alignment"),
+    ("train", "skip=always", "skip='always': expected one of regret, free"),
+    ("train", "policy.start=fun", "policy.start='fun': expected one of"),
+    ("train", "policy=attention policy.tokens=all", "policy.tokens='all': expected one of"),
+    ("train", "tau_spread=0.5", "spread=0.5: expected a factor of at least 1"),
+    ("train", "training.warm_up=-1", "training.warm_up=-1: expected a whole number"),
+    ("evaluate", "protocol=all", "protocol='all': expected one of heldout"),
+    ("evaluate", "policy=best", "policy='best': expected one of pretrained"),
+    ("evaluate", "protocol=heldout workers=0", "workers=0: expected a whole number"),
     ("train", "belief=5", "belief is a section of keys"),
     ("train", "setup.name=query", "type setup=query"),
     ("train", "policy.name=paper", "type policy=paper"),

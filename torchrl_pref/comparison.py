@@ -8,6 +8,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from tqdm import tqdm
 
+from torchrl_pref.acquisition import expected_alignment
 from torchrl_pref.checkpoint import Checkpoint
 from torchrl_pref.envs import FeedEnv, QueryEnv
 from torchrl_pref.errors import InputError, check_count, check_flag, check_seed
@@ -22,7 +23,7 @@ from torchrl_pref.experiment import (
 )
 from torchrl_pref.policies import Policy
 from torchrl_pref.queries import QueryPool
-from torchrl_pref.strategies import Greedy, RandomAsk, RandomQuery
+from torchrl_pref.strategies import Greedy, QuantileAsk, RandomAsk, RandomQuery
 
 FIRST_EVALUATION_SEED = 2**31
 """Evaluation seeds lie where no training seed does: the humans of the one are not the other's."""
@@ -75,7 +76,7 @@ def check_evaluation(settings: Settings) -> tuple[int, int]:
 def compare(
     settings: Settings, task: Task, pool: QueryPool, learned: Mapping[str, Checkpoint]
 ) -> dict[str, Evaluation]:
-    """Random, greedy information gain and learned policies on the same humans and luck.
+    """Baselines and learned policies on the same humans and luck.
 
     Random and greedy choose from the whole pool, as in the paper's Figure 1, whatever the setup.
 
@@ -86,7 +87,8 @@ def compare(
         learned: checkpoints to evaluate, by the name to show.
 
     Returns:
-        By name: ``random``, ``greedy``, for a feed also ``ask all``, and the learned ones.
+        By name: ``random``, ``greedy`` (information gain), ``greedy alignment``, for a feed also
+        ``ask all`` and ``quantile`` (of alignment), and the learned ones.
     """
     n_humans, seed = check_evaluation(settings)
     humans = draw_humans(make_query_env(settings, task, pool, n_humans, seed))
@@ -95,10 +97,12 @@ def compare(
     query_env = make_query_env(settings, task, pool, n_humans, seed)
     runs.append(("random", query_env, RandomQuery(seed + 1), False))
     runs.append(("greedy", query_env, Greedy(task.response_model), False))
+    by_alignment = Greedy(task.response_model, expected_alignment)
+    runs.append(("greedy alignment", query_env, by_alignment, False))
     if settings["setup"]["name"] == "feed":
-        runs.append(
-            ("ask all", make_feed_env(settings, task, pool, n_humans, seed), RandomAsk(), False)
-        )
+        feed_env = make_feed_env(settings, task, pool, n_humans, seed)
+        runs.append(("ask all", feed_env, RandomAsk(), False))
+        runs.append(("quantile", feed_env, QuantileAsk(feed_env, expected_alignment), False))
     for name, checkpoint in learned.items():
         env, policy = _load_policy(checkpoint, task, pool, n_humans, seed)
         sample = check_flag("policy.sample", checkpoint.settings["policy"]["sample"])

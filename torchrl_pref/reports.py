@@ -26,13 +26,19 @@ Results = Mapping[str, Evaluation]
 STYLE = {
     "random": ("#7f7f7f", "--"),
     "greedy": ("#1f1f1f", "-"),
+    "greedy alignment": ("#009e73", "-"),
     "ask all": ("#000000", ":"),
+    "quantile": ("#cc79a7", "-."),
     "RL": ("#0072b2", "-"),
     "RL-feed": ("#d55e00", "-"),
 }
 """Colour (Okabe and Ito's, told apart by colour-blind readers) and line of each strategy."""
 
-NAMES = {"greedy": "greedy information gain", "ask all": "ask all (feed)"}
+NAMES = {
+    "greedy": "greedy information gain",
+    "ask all": "ask all (feed)",
+    "quantile": "best quantile (feed)",
+}
 
 
 def milestones(budget: int) -> list[int]:

@@ -1,0 +1,112 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from test_training import settings_of, trainer_of
+from torch import Generator
+
+from torchrl_pref import heldout
+from torchrl_pref.checkpoint import Checkpoint
+from torchrl_pref.errors import InputError
+from torchrl_pref.experiment import make_checkpoint, make_pools, make_task
+from torchrl_pref.features import Normalizer, balance
+from torchrl_pref.heldout import Cell, Job, Outcome, run_protocol, two_way_interval
+from torchrl_pref.heldout_report import paired, reaches, write_heldout
+from torchrl_pref.queries import gridworld_pool
+
+
+def checkpoint_of(settings: dict[str, Any]) -> Checkpoint:
+    trainer, task = trainer_of(settings)
+    return make_checkpoint(settings, task, trainer)
+
+
+def outcome(alignment: torch.Tensor) -> Outcome:
+    table = alignment[..., 0, 0]
+    return Outcome(alignment, table, table, table)
+
+
+def test_interval_covers_pools_and_seeds(generator: Generator) -> None:
+    """Values are a pool effect plus a seed effect: the mean has the variance of both means."""
+    pools = torch.randn(400, 10, 1, generator=generator)
+    seeds = 0.5 * torch.randn(400, 1, 5, generator=generator)
+    covered = widths = 0.0
+    for table in pools + seeds:
+        low, high = two_way_interval(table, 500)
+        covered += low <= 0 <= high
+        widths += (high - low) / 400
+    # Percentile intervals of so few clusters are somewhat too narrow.
+    assert 0.80 < covered / 400 < 0.97
+    assert widths == pytest.approx(2 * 1.96 * (1 / 10 + 0.25 / 5) ** 0.5, rel=0.2)
+    assert two_way_interval(torch.full((3, 2), 0.7)) == (pytest.approx(0.7), pytest.approx(0.7))
+
+
+def test_differences_are_paired_and_levels_are_reached() -> None:
+    rising = torch.linspace(0, 1, 11).expand(2, 3, 4, 11)
+    one, other = outcome(rising), outcome(rising[:, :1] - 0.25)
+    assert torch.allclose(paired(one, other), torch.tensor(0.25))
+    assert torch.allclose(paired(one, outcome(rising[:, :1, :2])), torch.tensor(0.0))
+    assert reaches(one, 0.55) == "6"
+    assert reaches(other, 0.9) == "never"
+
+
+def test_balanced_options_differ_equally_in_every_direction() -> None:
+    raw = gridworld_pool(400).features
+    features = balance(raw)(raw)
+    gaps = features[:, 0] - features[:, 1]
+    covariance = gaps.mT @ gaps / len(gaps)
+    assert torch.allclose(covariance, covariance[0, 0] * torch.eye(4), atol=0.02)
+    with pytest.raises(InputError, match="cannot be balanced"):
+        balance(raw[..., [0, 1, 0]])
+
+
+@pytest.mark.parametrize("setup", ["query", "feed"])
+def test_protocol_pairs_all_strategies_on_pools_of_its_own(
+    setup: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(heldout, "HUMANS", 6)
+    monkeypatch.setattr(heldout, "FINE_HUMANS", 2)
+    monkeypatch.setattr(heldout, "FINE_SAMPLES", 40)
+    settings = settings_of(setup)
+    cell = Cell(setup, "noisy")
+    learned = [checkpoint_of({**settings, "seed": seed}) for seed in (0, 1)]
+    rows = [heldout._run_pool(Job(settings, cell, pool, learned, (0.2,))) for pool in (0, 1)]
+    for row in rows:
+        assert len(row["RL"]) == 2
+        # All start from the same prior samples of the same humans.
+        start = row["RL"][0].alignment[:, 0]
+        for name, results in row.items():
+            if "M=40" not in name:
+                assert torch.equal(results[0].alignment[:, 0], start)
+    if setup == "feed":  # untrained, the policy is the quantile rule
+        rule, policy = rows[0]["quantile of alignment"][0], rows[0]["RL"][0]
+        assert torch.equal(rule.alignment, policy.alignment)
+    trained = make_pools(settings)
+    for pool in (0, 1):
+        _, own = heldout._task_and_pool(Job(settings, cell, pool))
+        task = make_task(*trained, "noisy")
+        assert own.digest not in (task.train.digest, task.test.digest)
+    write_heldout(tmp_path, {cell: heldout._gather(rows)})
+    assert (tmp_path / "heldout.png").stat().st_size > 10_000
+    assert "RL minus it" in (tmp_path / "heldout.txt").read_text()
+
+
+def test_policies_of_other_tasks_are_refused() -> None:
+    settings = settings_of("query")
+    paper = checkpoint_of(settings_of("query", policy="paper"))
+    with pytest.raises(InputError, match="indices of its training pool"):
+        run_protocol(settings, {Cell("query", "noisy"): [paper]}, 1)
+    other = checkpoint_of(settings)
+    other.settings["setup"]["budget"] = 9
+    with pytest.raises(InputError, match=r"setup\.budget=9"):
+        run_protocol(settings_of("query"), {Cell("query", "noisy"): [other]}, 1)
+
+
+def test_normaliser_is_that_of_the_training_pool() -> None:
+    settings = settings_of("query")
+    train, _ = make_pools(settings)
+    task, own = heldout._task_and_pool(Job(settings, Cell("query", "noisy"), 3))
+    assert torch.equal(task.normalizer.mean, Normalizer.fit(train.features).mean)
+    assert own.features.mean().abs() > 1e-6

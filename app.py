@@ -52,14 +52,16 @@ def plain_settings(config: DictConfig) -> dict[str, Any]:
     """
     settings = OmegaConf.to_container(config, resolve=True)
     assert isinstance(settings, dict)
-    for section in SECTIONS & set(settings):
+    choices = HydraConfig.get().runtime.choices
+    sections = SECTIONS if "policy" in choices else SECTIONS - {"policy"}
+    for section in sections & set(settings):
         if not isinstance(settings[section], dict):
             raise InputError(
                 f"{section}={settings[section]!r}: {section} is a section of keys and not a value; "
                 f"type {section}.<key>=<value>, --help lists them"
             )
     for group in ("setup", "policy"):
-        chosen = HydraConfig.get().runtime.choices.get(group)
+        chosen = choices.get(group)
         if chosen is not None and settings[group]["name"] != chosen:
             name = settings[group]["name"]
             raise InputError(

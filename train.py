@@ -67,6 +67,11 @@ def begin(folder: Path, settings: dict[str, Any], start: str | None) -> float:
 def go_on(folder: Path, typed: dict[str, Any]) -> float:
     """An old run, from its last checkpoint, with its own settings."""
     checkpoint = Checkpoint.load(folder)
+    if "optimizer" not in checkpoint.training:
+        raise InputError(
+            f"resume={folder}: holds a policy without the state of its training; start a new run "
+            f"from it by checkpoint={folder}"
+        )
     settings = checkpoint.settings
     for key in ("device", "threads"):
         if app.was_typed(key):

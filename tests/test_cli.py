@@ -202,6 +202,8 @@ def test_help_explains_every_key(script: str) -> None:
             assert value.replace("null", "none") in defaults, key
 
 
+PRETRAINED = ROOT / "torchrl_pref" / "pretrained" / "query-noisy-0.pt"
+
 BAD_INPUT = [
     ("train", "setup=nonsense", "Could not find 'setup/nonsense'"),
     ("train", "policy=nonsense", "Could not find 'policy/nonsense'"),
@@ -235,6 +237,8 @@ BAD_INPUT = [
     ("train", "pool.train={tmp}/plain.pt pool.test={tmp}/wide.pt", "D=5: expected D=4"),
     ("train", "hydra.run.dir={tmp}/text.pt/run", "the run folder cannot be written"),
     ("train", "hydra.run.dir=/sys", "cannot be written"),
+    ("train", "resume={tmp}/text.pt", "cannot be read as a torchrl_pref checkpoint"),
+    ("train", f"resume={PRETRAINED}", "holds a policy without the state of its training"),
     ("train", "objective=fun", "objective='fun': expected one of information_gain, alignment"),
     ("train", "skip=always", "skip='always': expected one of regret, free"),
     ("train", "policy.start=fun", "policy.start='fun': expected one of"),

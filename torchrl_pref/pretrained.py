@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from torchrl_pref.checkpoint import Checkpoint
+from torchrl_pref.checkpoint import FILE_NAME, Checkpoint
 from torchrl_pref.envs import FeedEnv, QueryEnv
 from torchrl_pref.errors import check_choice, check_count
 from torchrl_pref.policies import Policy, scorer_policy
@@ -46,3 +46,25 @@ def pretrained_policy(env: QueryEnv | FeedEnv, tau: str, seed: int = 0) -> Polic
     policy = scorer_policy(env)
     policy.weights.load_state_dict(pretrained_checkpoint(setup, tau, seed).weights)
     return policy
+
+
+def export(sweep: str | Path) -> list[Path]:
+    """Put the policies of a sweep over ``setup``, ``tau`` and ``seed`` into the package.
+
+    What only training needs is left out; the rest of each checkpoint is kept as it is.
+
+    Args:
+        sweep: a folder with one run folder for each policy.
+
+    Returns:
+        The files that were written.
+    """
+    written = []
+    for path in sorted(Path(sweep).rglob(FILE_NAME)):
+        checkpoint = Checkpoint.load(path)
+        settings = checkpoint.settings
+        checkpoint.training = {"history": checkpoint.history}
+        name = f"{settings['setup']['name']}-{settings['tau']}-{settings['seed']}.pt"
+        checkpoint.save(FOLDER / name)
+        written.append(FOLDER / name)
+    return written

@@ -48,8 +48,8 @@ class Evaluation:
 
 
 def draw_humans(env: QueryEnv | FeedEnv) -> TensorDict:
-    """Humans, the luck of their answers and prior samples, for every strategy to start from."""
-    return env.reset().select("human", "samples")
+    """Humans, their luck, prior samples and a feed's offers, for every strategy to start from."""
+    return env.reset().select("human", "samples", "offers", strict=False)
 
 
 def evaluate(

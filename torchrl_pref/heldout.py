@@ -9,15 +9,18 @@ seeds: humans of one pool share it, and policies of one training share that.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from multiprocessing import get_context
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Generator, Tensor
+from torch import Generator, Tensor, nn
 from tqdm import tqdm
 
 from torchrl_pref.acquisition import expected_alignment, volume_removal
@@ -47,9 +50,12 @@ from torchrl_pref.strategies import (
     ThresholdAsk,
 )
 
-POOLS, BALANCED_POOLS, HUMANS = 10, 4, 100
+POOLS, BALANCED_POOLS, HUMANS = 10, 3, 100
 
-FINE_SAMPLES, FINE_HUMANS = 4000, 10
+TENSORS = ("alignment", "alignment_of_mean", "information", "ess", "asked", "offered", "repeated")
+"""What an evaluation holds for each human."""
+
+FINE_SAMPLES, FINE_HUMANS = 4000, 5
 """Greedy with 40 times the samples is 40 times the work: it faces a few humans of each pool."""
 
 THRESHOLDS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5)
@@ -78,7 +84,7 @@ class Outcome:
     Attributes:
         alignment: (P S B H+1).
         bits, repeated: (P S), means over humans after the last query.
-        seconds: (P S), a query.
+        seconds: (P S), to choose a query.
     """
 
     alignment: Tensor
@@ -185,6 +191,57 @@ def _task_and_pool(job: Job) -> tuple[Task, QueryPool]:
     return task, task.test
 
 
+class Chorus(TensorDictModuleBase):
+    """Strategies side by side in one environment: each decides for its own share of the sessions.
+
+    One large batch is much faster than a small one for each strategy.
+
+    Attributes:
+        seconds: spent by each strategy on its decisions.
+    """
+
+    in_keys: list[str] = []
+    out_keys = ["action"]
+
+    def __init__(self, strategies: Sequence[TensorDictModuleBase]) -> None:
+        super().__init__()
+        self.strategies = nn.ModuleList(strategies)
+        self.seconds = [0.0] * len(strategies)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action`` (B)."""
+        actions = []
+        shares = tensordict.chunk(len(self.strategies))
+        for number, (strategy, share) in enumerate(zip(self.strategies, shares, strict=True)):
+            start = time.perf_counter()
+            actions.append(strategy(share)["action"])
+            self.seconds[number] += time.perf_counter() - start
+        return tensordict.set("action", torch.cat(actions))
+
+
+MakeEnv = Callable[[int], QueryEnv | FeedEnv]
+"""From a number of sessions to an environment for as many."""
+
+
+def run_side_by_side(
+    make_env: MakeEnv, humans: TensorDictBase, strategies: Mapping[str, TensorDictModuleBase]
+) -> dict[str, Evaluation]:
+    """Every strategy with the same humans (B), in one batch.
+
+    ``seconds_per_query`` is the time to choose alone: the belief is updated for all together.
+    """
+    count, chorus = len(humans), Chorus(list(strategies.values()))
+    env = make_env(count * len(strategies))
+    whole = evaluate(env, chorus, torch.cat([humans] * len(strategies)))
+    results = {}
+    for number, name in enumerate(strategies):
+        rows = slice(number * count, (number + 1) * count)
+        tensors = {key: value[rows] for key, value in vars(whole).items() if key in TENSORS}
+        seconds = chorus.seconds[number] / max(1, int(tensors["asked"].sum()))
+        results[name] = Evaluation(**tensors, seconds_per_query=seconds)
+    return results
+
+
 def _run_pool(job: Job) -> dict[str, list[Evaluation]]:
     """Every strategy of a cell on one pool; a list holds one evaluation for each training seed."""
     torch.set_num_threads(1)
@@ -192,62 +249,66 @@ def _run_pool(job: Job) -> dict[str, list[Evaluation]]:
     # A seed of its own for each pool, out of reach of any training.
     seed = FIRST_EVALUATION_SEED + 1000 + job.pool
     make = make_feed_env if job.cell.setup == "feed" else make_query_env
-    env = make(job.settings, task, pool, HUMANS, seed)
+
+    def make_env(sessions: int, settings: Settings = job.settings) -> QueryEnv | FeedEnv:
+        return make(settings, task, pool, sessions, seed)
+
+    env = make_env(HUMANS)
     humans = draw_humans(env)
-
-    def run(
-        strategy: TensorDictModuleBase, where: QueryEnv | FeedEnv = env, count: int = HUMANS
-    ) -> Evaluation:
-        where.set_seed(seed)
-        known = humans if count == HUMANS else humans[:count].select("human")
-        return evaluate(where, strategy, known)
-
-    results = {name: [run(*case)] for name, *case in _baselines(job, task, pool, env, seed)}
-    results["RL"] = []
-    for checkpoint in job.learned:
+    strategies = _baselines(job, task, env, seed)
+    for number, checkpoint in enumerate(job.learned):
         policy = make_policy(checkpoint.settings, env)
         load_weights(policy, checkpoint)
-        results["RL"].append(run(policy.strategy))
-    return results
+        strategies[f"RL {number}"] = policy.strategy
+    found = run_side_by_side(make_env, humans, strategies)
+    if job.cell.setup == "query" and job.cell.features == "corners":
+        greedy = {"greedy information, no repeats": Greedy(task.response_model)}
+        setup = {**job.settings["setup"], "repeats": False}
+        unrepeated = partial(make_env, settings={**job.settings, "setup": setup})
+        found |= run_side_by_side(unrepeated, humans, greedy)
+        greedy = {f"greedy information, M={FINE_SAMPLES}": Greedy(task.response_model)}
+        belief = {**job.settings["belief"], "samples": FINE_SAMPLES}
+        fine = partial(make_env, settings={**job.settings, "belief": belief})
+        found |= run_side_by_side(fine, humans[:FINE_HUMANS].select("human"), greedy)
+    learned = [found.pop(f"RL {number}") for number in range(len(job.learned))]
+    return {name: [result] for name, result in found.items()} | {"RL": learned}
 
 
 def _baselines(
-    job: Job, task: Task, pool: QueryPool, env: QueryEnv | FeedEnv, seed: int
-) -> Iterator[tuple[Any, ...]]:
-    """Name and strategy of each baseline, and where it runs if not in the cell's environment."""
+    job: Job, task: Task, env: QueryEnv | FeedEnv, seed: int
+) -> dict[str, TensorDictModuleBase]:
+    """The strategies that are not learned, by name."""
     model = task.response_model
     if isinstance(env, FeedEnv):
-        yield "ask all", RandomAsk()
-        yield f"threshold {job.thresholds[0]:g} bits", ThresholdAsk(env, job.thresholds[0])
-        yield "quantile of information", QuantileAsk(env)
-        yield "quantile of alignment", QuantileAsk(env, expected_alignment)
-        return
-    yield "random", RandomQuery(seed + 1)
-    yield "greedy information", Greedy(model)
-    yield "greedy alignment", Greedy(model, expected_alignment)
-    if job.cell.features == "balanced":
-        return
-    yield "volume removal", Greedy(model, volume_removal)
-    yield "two-step lookahead", Lookahead(model)
-    settings = {**job.settings, "setup": {**job.settings["setup"], "repeats": False}}
-    unrepeated = make_query_env(settings, task, pool, HUMANS, seed)
-    yield "greedy information, no repeats", Greedy(model), unrepeated
-    belief = {**job.settings["belief"], "samples": FINE_SAMPLES}
-    fine = make_query_env({**job.settings, "belief": belief}, task, pool, FINE_HUMANS, seed)
-    yield f"greedy information, M={FINE_SAMPLES}", Greedy(model), fine, FINE_HUMANS
+        return {
+            "ask all": RandomAsk(),
+            f"threshold {job.thresholds[0]:g} bits": ThresholdAsk(env, job.thresholds[0]),
+            "quantile of information": QuantileAsk(env),
+            "quantile of alignment": QuantileAsk(env, expected_alignment),
+        }
+    strategies: dict[str, TensorDictModuleBase] = {
+        "random": RandomQuery(seed + 1),
+        "greedy information": Greedy(model),
+        "greedy alignment": Greedy(model, expected_alignment),
+    }
+    if job.cell.features == "corners":
+        strategies["volume removal"] = Greedy(model, volume_removal)
+        strategies["two-step lookahead"] = Lookahead(model)
+    return strategies
 
 
 def _fit_threshold(job: Job) -> Tensor:
     """Final alignment of each threshold on the training pool, (thresholds)."""
     torch.set_num_threads(1)
     task, _ = _task_and_pool(job)
-    env = make_feed_env(job.settings, task, task.train, HUMANS, 0)
-    humans, finals = draw_humans(env), []
-    for threshold in job.thresholds:
-        env.set_seed(0)
-        result = evaluate(env, ThresholdAsk(env, threshold), humans)
-        finals.append(result.alignment[:, -1].mean())
-    return torch.stack(finals)
+
+    def make_env(sessions: int) -> FeedEnv:
+        return make_feed_env(job.settings, task, task.train, sessions, 0)
+
+    env = make_env(HUMANS)
+    rules = {f"{bits:g}": ThresholdAsk(env, bits) for bits in job.thresholds}
+    results = run_side_by_side(make_env, draw_humans(env), rules)
+    return torch.stack([result.alignment[:, -1].mean() for result in results.values()])
 
 
 def _gather(pools: Sequence[Mapping[str, Sequence[Evaluation]]]) -> dict[str, Outcome]:

@@ -75,7 +75,7 @@ def cell_table(cell: Cell, outcomes: dict[str, Outcome], style: str = "simple") 
         row[f"reaches {at_end:.3f}"] = reaches(outcome, at_end)
         row["bits"] = f"{outcome.bits.mean():.2f}"
         row["repeats"] = f"{outcome.repeated.mean():.1f}"
-        row["ms a query"] = f"{1000 * outcome.seconds.mean():.2f}"
+        row["ms to choose"] = f"{1000 * outcome.seconds.mean():.2f}"
         rows.append(row)
     return tabulate(rows, headers="keys", tablefmt=style, disable_numparse=True)
 

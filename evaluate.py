@@ -70,6 +70,8 @@ def evaluate_pretrained(settings: dict[str, Any]) -> Evaluated:
     panels: comparison.Panels = {}
     for tau in taus:
         checkpoint = pretrained_checkpoint(setup, tau)
+        for section in ("setup", "belief", "tau_spread", "device"):
+            checkpoint.settings[section] = settings[section]
         label = f"{comparison.label_of(checkpoint.settings)} (pretrained)"
         task = experiment.make_task(*pools, tau)
         panels |= comparison.evaluate_panels(settings, task, {label: checkpoint})

@@ -144,7 +144,8 @@ class OfferScorer(nn.Module):
         # Half a rank breaks ties in favour of asking; at a share of 1 all that are left are asked.
         margin = ranks[..., self.greedy, None] - (1 - share) + 0.5 / REFERENCE + (share >= 1)
         correction = self.network(torch.cat([offer, ranks, share, belief], -1))
-        ask = self.log_scale.exp() * (margin + correction)
+        # The correction is in logits: in ranks, as small a step would be a large one.
+        ask = self.log_scale.exp() * margin + correction
         return torch.cat([torch.zeros_like(ask), ask], -1)
 
 

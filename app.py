@@ -53,8 +53,7 @@ def plain_settings(config: DictConfig) -> dict[str, Any]:
     settings = OmegaConf.to_container(config, resolve=True)
     assert isinstance(settings, dict)
     choices = HydraConfig.get().runtime.choices
-    sections = SECTIONS if "policy" in choices else SECTIONS - {"policy"}
-    for section in sections & set(settings):
+    for section in SECTIONS & set(settings):
         if not isinstance(settings[section], dict):
             raise InputError(
                 f"{section}={settings[section]!r}: {section} is a section of keys and not a value; "

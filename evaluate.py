@@ -20,6 +20,17 @@ from torchrl_pref.errors import InputError, check_choice, check_count, one_line_
 from torchrl_pref.pretrained import SEEDS, pretrained_checkpoint
 from torchrl_pref.queries import QueryPool
 
+PROTOCOL_KEYS: tuple[str, ...] = (
+    "checkpoint",
+    "workers",
+    "device",
+    "threads",
+    "setup.budget",
+    "setup.offers",
+)
+PROTOCOL_KEYS += ("belief.", "grid.", "pool.size", "pool.options", "pool.seed", "hydra.")
+"""What may be typed beside ``protocol``; the rest is the protocol's own."""
+
 Evaluated = tuple[comparison.Panels, dict[str, dict[str, list[float]]]]
 """Panels of evaluations, and the training histories behind them."""
 
@@ -33,44 +44,63 @@ def job(config: DictConfig) -> None:
             settings = app.plain_settings(config)
             app.use_threads(settings)
             named = settings["checkpoint"]
-            for key, word in (("protocol", "heldout"), ("policy", "pretrained")):
-                if settings[key] is not None:
-                    check_choice(key, settings[key], (word,))
+            check_lists(settings)
             if settings["protocol"] is not None:
+                check_choice("protocol", settings["protocol"], ("heldout",))
+                app.refuse_other_overrides("protocol", PROTOCOL_KEYS)
                 run_heldout(settings, folder)
-            elif named is None and settings["policy"] is not None:
+            elif "policy" in settings:
+                check_choice("policy", settings["policy"]["name"], ("pretrained",))
+                if named is not None:
+                    raise InputError(
+                        "policy=pretrained and checkpoint=… name two policies; expected one of "
+                        "them; pretrained policies are files too: checkpoint=[a.pt,b.pt]"
+                    )
                 reports.write_report(folder, *evaluate_pretrained(settings))
             elif named is None:
                 reports.write_report(folder, evaluate_baselines(settings), {})
             else:
                 allowed = ("evaluation.", "pool.test", "device", "threads", "hydra.")
                 app.refuse_other_overrides("checkpoint", allowed)
-                names = named if isinstance(named, list) else [named]
-                paths = find_checkpoints([str(name) for name in names])
+                paths = find_checkpoints([str(name) for name in listed(named)])
                 reports.write_report(folder, *evaluate_checkpoints(settings, paths))
     finally:
         app.discard_if_empty(folder)
 
 
+def check_lists(settings: dict[str, Any]) -> None:
+    """Refuse empty lists where at least one thing has to be evaluated.
+
+    Raises:
+        InputError: ``tau`` or ``checkpoint`` is empty.
+    """
+    for key, example in (("tau", "[noisy,optimal]"), ("checkpoint", "outputs/<run>")):
+        if settings[key] == []:
+            raise InputError(f"{key}=[]: expected at least one, such as {key}={example}")
+
+
+def listed(value: Any) -> list[Any]:
+    """A list as it is, and anything else as a list of one."""
+    return value if isinstance(value, list) else [value]
+
+
 def evaluate_baselines(settings: dict[str, Any]) -> comparison.Panels:
     """Random and greedy, a panel for each tau."""
-    taus = settings["tau"] if isinstance(settings["tau"], list) else [settings["tau"]]
     pools = experiment.make_pools(settings)
     panels: comparison.Panels = {}
-    for task in [experiment.make_task(*pools, tau) for tau in taus]:
+    for task in [experiment.make_task(*pools, tau) for tau in listed(settings["tau"])]:
         panels |= comparison.evaluate_panels(settings, task, {})
     return panels
 
 
 def evaluate_pretrained(settings: dict[str, Any]) -> Evaluated:
     """The policies that come with the package beside the baselines, a panel for each tau."""
-    taus = settings["tau"] if isinstance(settings["tau"], list) else [settings["tau"]]
     pools = experiment.make_pools(settings)
     setup = settings["setup"]["name"]
     panels: comparison.Panels = {}
-    for tau in taus:
+    for tau in listed(settings["tau"]):
         checkpoint = pretrained_checkpoint(setup, tau)
-        for section in ("setup", "belief", "tau_spread", "device"):
+        for section in ("setup", "belief", "skip", "tau_spread", "device"):
             checkpoint.settings[section] = settings[section]
         label = f"{comparison.label_of(checkpoint.settings)} (pretrained)"
         task = experiment.make_task(*pools, tau)
@@ -87,10 +117,7 @@ def run_heldout(settings: dict[str, Any], folder: Path) -> None:
                 pretrained_checkpoint(setup, tau, seed) for seed in range(SEEDS)
             ]
     else:
-        named = settings["checkpoint"]
-        for path in find_checkpoints(
-            [str(n) for n in (named if isinstance(named, list) else [named])]
-        ):
+        for path in find_checkpoints([str(name) for name in listed(settings["checkpoint"])]):
             checkpoint = Checkpoint.load(path)
             cell = heldout.Cell(checkpoint.settings["setup"]["name"], checkpoint.settings["tau"])
             learned.setdefault(cell, []).append(checkpoint)
@@ -126,7 +153,8 @@ def evaluate_checkpoints(settings: dict[str, Any], paths: list[Path]) -> Evaluat
         for section in ("evaluation", "device"):
             checkpoint.settings[section] = settings[section]
         pools = path.with_name("train_pool.pt"), path.with_name("test_pool.pt")
-        name = str(path.parent.relative_to(common))
+        named = path.parent if path.name == FILE_NAME else path.with_suffix("")
+        name = str(named.relative_to(common))
         runs.append((name, checkpoint, experiment.reload_task(checkpoint, *pools)))
     panels: comparison.Panels = {}
     for panel_settings, task, learned in comparison.group_checkpoints(runs):

@@ -6,6 +6,7 @@ from conftest import RESPONSE_MODELS
 from torch import Generator, Tensor
 
 from torchrl_pref.belief import (
+    GROUP,
     Belief,
     feature_gaps,
     kish_share,
@@ -212,3 +213,28 @@ def test_resampling_follows_the_weights(generator: Generator) -> None:
     assert counts.tolist() == pytest.approx([1, 2, 0, 1], abs=0.05)
     assert float(kish_share(log_weights[0])) == pytest.approx(16 / (4 * 6))
     assert float(kish_share(torch.full((4,), -math.inf))) == 0
+
+
+@pytest.mark.parametrize("model", RESPONSE_MODELS, ids=str)
+def test_large_batches_lose_no_answer(model: ResponseModel, generator: Generator) -> None:
+    """Sessions are moved in groups by how many answers they hold; an empty row may come first."""
+    sessions = 3 * GROUP + 7
+    belief = Belief(model, samples=40)
+    normals = torch.eye(3)
+    earlier = torch.zeros(sessions, 3, 1, 3)
+    for row, count in enumerate((2, 3)):
+        earlier[row::2, 1:count, 0] = normals[: count - 1]
+    samples = belief.prior(sessions, 3, generator)
+    # A belief that knows its earlier answers, which the step must keep.
+    for row, count in enumerate((2, 3)):
+        samples[row::2, :, : count - 1] = samples[row::2, :, : count - 1].abs()
+    newest = normals[2].expand(sessions, 1, 3)
+    after, _, used = belief.update(
+        samples, torch.full((sessions,), 40.0), earlier, newest, generator
+    )
+    assert used.all()
+    kept = [(after[row::2, :, :count] >= -1e-5).float().mean() for row, count in enumerate((1, 2))]
+    assert min(kept) > (0.999 if isinstance(model, Optimal) else 0.8)
+    assert (after[..., 2] >= -1e-5).float().mean() > (0.999 if isinstance(model, Optimal) else 0.8)
+    # Every session is where it was: the two kinds differ in the second direction.
+    assert after[0::2, :, 1].mean() < 0.15 < after[1::2, :, 1].mean()

@@ -26,7 +26,7 @@ ROOT = Path(__file__).parent.parent
 
 TINY_TASK = ["belief.samples=10", "belief.moves=1", "pool.size=40", "setup.budget=4"]
 TINY_TASK += ["evaluation.humans=6"]
-TINY = [*TINY_TASK, "training.updates=3", "training.sessions=4", "training.steps=3"]
+TINY = [*TINY_TASK, "training.updates=3", "training.sessions=4", "training.steps=8"]
 
 
 def start(script: str, *arguments: str, cwd: Path = ROOT) -> subprocess.Popen[str]:
@@ -243,10 +243,17 @@ BAD_INPUT = [
     ("train", "skip=always", "skip='always': expected one of regret, free"),
     ("train", "policy.start=fun", "policy.start='fun': expected one of"),
     ("train", "policy=attention policy.tokens=all", "policy.tokens='all': expected one of"),
-    ("train", "tau_spread=0.5", "spread=0.5: expected a factor of at least 1"),
+    ("train", "tau_spread=0.5", "tau_spread=0.5: expected a factor of at least 1"),
     ("train", "training.warm_up=-1", "training.warm_up=-1: expected a whole number"),
     ("evaluate", "protocol=all", "protocol='all': expected one of heldout"),
-    ("evaluate", "policy=best", "policy='best': expected one of pretrained"),
+    ("evaluate", "policy=best", "Could not find 'policy/best'"),
+    ("evaluate", "policy=scorer", "policy='scorer': expected one of pretrained"),
+    ("evaluate", "policy=pretrained checkpoint=x", "name two policies"),
+    ("evaluate", "protocol=heldout setup=query", "setup=query: protocol=… brings its own"),
+    ("evaluate", "tau=[]", "tau=[]: expected at least one"),
+    ("evaluate", "checkpoint=[]", "checkpoint=[]: expected at least one"),
+    ("train", "policy=pretrained", "policy='pretrained': expected one of scorer"),
+    ("train", "pool.seed=536870912", "pool.seed=536870912: expected a whole number below"),
     ("evaluate", "protocol=heldout workers=0", "workers=0: expected a whole number"),
     ("train", "belief=5", "belief is a section of keys"),
     ("train", "setup.name=query", "type setup=query"),

@@ -99,7 +99,8 @@ def test_skips_are_free_and_offers_run_out(pool: QueryPool) -> None:
         session["action"] = torch.zeros(4, dtype=torch.long)
         session = env.step(session)["next"]
         assert (session["reward"] == 0).all()
-    assert session["truncated"].all()
+    assert session["terminated"].all()
+    assert not session["truncated"].any()
 
 
 def test_entropy_falls_by_a_bit_for_a_halved_interval() -> None:
@@ -129,5 +130,5 @@ def test_humans_of_a_spread_differ_in_care(pool: QueryPool) -> None:
     right = human.respond(queries, drawn, torch.zeros(4000, dtype=torch.long)) == returns.argmax(-1)
     careful = drawn["care"].squeeze(-1) > 1
     assert right[careful].float().mean() > right[~careful].float().mean() + 0.05
-    with pytest.raises(InputError, match=r"spread=0.5"):
+    with pytest.raises(InputError, match=r"tau_spread=0.5"):
         SimulatedHuman(model, spread=0.5)

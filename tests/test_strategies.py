@@ -15,6 +15,7 @@ from torchrl_pref.acquisition import (
 )
 from torchrl_pref.envs import FeedEnv, QueryEnv
 from torchrl_pref.errors import InputError
+from torchrl_pref.objectives import make_objective
 from torchrl_pref.queries import QueryPool
 from torchrl_pref.responses import ResponseModel
 from torchrl_pref.strategies import (
@@ -65,16 +66,23 @@ def test_lookahead_agrees_with_brute_force(
     pool = QueryPool(torch.randn(8, options, 4, generator=generator))
     env = make(QueryEnv, pool, model, batch=5)
     session = session_of(env)
+    session["action_mask"][:, 5:] = False
     chosen = Lookahead(model, beam=8)(session.clone())["action"]
+    assert (chosen < 5).all()
+    last = session.clone()
+    last["history", "queries"][:, :4] = 0
+    gain = make_objective("information_gain").forecast(last, last["queries"], model)
+    final = Lookahead(model, beam=8)(last)["action"]
+    assert torch.allclose(gain[range(5), final], gain[:, :5].amax(1), atol=1e-6)
     for b in range(5):
         samples, queries = session["samples"][b : b + 1], session["queries"][b : b + 1]
         probs = predict_answers(samples, queries, model).probs[0].double()
         values = []
-        for first in probs:
+        for first in probs[:5]:
             value = weighted_gain(first, torch.ones(20))
             for answer in first.unbind(-1):
                 if answer.sum() > 0:
-                    best = max(weighted_gain(second, answer) for second in probs)
+                    best = max(weighted_gain(second, answer) for second in probs[:5])
                     value += float(answer.mean()) * best
             values.append(value)
         assert values[int(chosen[b])] == pytest.approx(max(values), abs=1e-4)

@@ -116,12 +116,40 @@ def test_resumed_run_equals_an_uninterrupted_one_bit_for_bit(
 
 def test_a2c_learns_what_the_feed_rewards(tmp_path: Path) -> None:
     """With the paper's ±r reward, asking pays: the episodes get shorter (the paper's Figure 2)."""
-    settings = settings_of(updates=40, sessions=32, steps=8, optimizer="adam", learning_rate=0.01)
+    constants = {"sessions": 32, "steps": 8, "optimizer": "adam", "learning_rate": 0.01}
+    settings = settings_of(policy="paper", updates=60, **constants)
+    settings |= {"objective": "information_gain", "skip": "regret"}
     trainer, _ = trainer_of(settings)
     trainer.run(tmp_path, lambda: None)
     lengths = trainer.progress.history["train/episode_length"]
     assert sum(lengths[-5:]) / 5 < sum(lengths[1:6]) / 5 - 1
     assert sum(trainer.progress.history["train/reward"][-5:]) > 0
+
+
+def test_warm_up_spares_the_actor_and_the_average_follows() -> None:
+    trainer, _ = trainer_of(settings_of(warm_up=2, average=0.9, learning_rate=0.01))
+    weights = trainer.policy.weights
+
+    def part(name: str) -> torch.Tensor:
+        return torch.cat([p.detach().flatten().clone() for p in weights[name].parameters()])
+
+    def averaged() -> torch.Tensor:
+        names = [name for name, _ in weights.named_parameters()]
+        return torch.cat([trainer.average[name].flatten() for name in names])
+
+    def raw() -> torch.Tensor:
+        return torch.cat([p.detach().flatten().clone() for _, p in weights.named_parameters()])
+
+    batches = iter(trainer.collector)
+    actor, expected = part("actor"), raw()
+    for update in range(4):
+        critic = part("critic")
+        trainer.update(next(batches))
+        trainer.progress.update += 1
+        assert torch.equal(part("actor"), actor) == (update < 2)
+        assert not torch.equal(part("critic"), critic)
+        expected = 0.9 * expected + 0.1 * raw()
+        assert torch.allclose(averaged(), expected, atol=1e-6)
 
 
 def test_ctrl_c_stops_after_the_update_and_saves(tmp_path: Path) -> None:

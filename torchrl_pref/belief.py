@@ -108,15 +108,17 @@ class Belief:
         Args:
             samples: (S M D), samples of the belief before the answer.
             ess: (S), their effective sample size.
-            earlier: (S H K-1 D), :func:`feature_gaps` of the earlier answers; zero rows come
-                last and are ignored, H may be 0.
+            earlier: (S H K-1 D), :func:`feature_gaps` of the earlier answers; zero rows are
+                ignored, H may be 0.
             newest: (S K-1 D), feature gaps of the answer to condition on.
             generator: the source of all randomness, on the device of the samples.
         """
         if len(samples) <= GROUP:
             return self._update(samples, ess, earlier, newest, generator)
         # Sessions with as many answers go together, so that none pays for another's.
-        n_answers = (earlier != 0).any(-1).any(-1).sum(1)
+        turns = torch.arange(1, earlier.shape[1] + 1, device=earlier.device)
+        answered = (earlier != 0).any(-1).any(-1) * turns
+        n_answers = answered.amax(1) if len(turns) else turns.new_zeros(len(samples))
         order = n_answers.argsort(stable=True)
         updates = []
         for group in order.split(GROUP):

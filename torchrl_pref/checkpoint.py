@@ -94,8 +94,11 @@ class Checkpoint:
         """
         expected = dict(self.pool_shape)
         found = {"N": len(pool), "K": pool.n_options, "D": pool.n_features}
-        if not self.picks_by_index:
-            expected.pop("N")
+        policy = self.settings["policy"]["name"]
+        made_for = {"scorer": "", "attention": "D"}.get(
+            policy, "NKD" if self.picks_by_index else "KD"
+        )
+        expected = {size: expected[size] for size in made_for}
         differs = [f"{k}={found[k]} (trained on {v})" for k, v in expected.items() if found[k] != v]
         if differs:
             raise InputError(

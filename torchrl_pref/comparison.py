@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModuleBase
@@ -129,6 +130,12 @@ def _load_policy(
     return env, policy
 
 
+def _feed_of(checkpoint: Checkpoint) -> tuple[Any, Any] | None:
+    """What is particular to the feed a policy was trained on, or None."""
+    setup = checkpoint.settings["setup"]
+    return (setup["offers"], setup["on_skip"]) if setup["name"] == "feed" else None
+
+
 def group_checkpoints(
     runs: Sequence[tuple[str, Checkpoint, Task]],
 ) -> list[tuple[Settings, Task, dict[str, Checkpoint]]]:
@@ -151,14 +158,18 @@ def group_checkpoints(
     for members in groups.values():
         _, first, task = members[0]
         learned = {}
+        all_of = [checkpoint for _, checkpoint, _ in members]
         for name, checkpoint, _ in members:
             for what, mine, theirs in (
                 ("the test pool", checkpoint.test_digest, first.test_digest),
                 ("the training pool", checkpoint.train_digest, first.train_digest),
                 ("budget", *(c.settings["setup"]["budget"] for c in (checkpoint, first))),
                 ("belief", *(c.settings["belief"] for c in (checkpoint, first))),
+                ("tau_spread", *(c.settings["tau_spread"] for c in (checkpoint, first))),
+                ("skip", *(c.settings["skip"] for c in (checkpoint, first))),
+                ("feed", _feed_of(checkpoint), next(filter(None, map(_feed_of, all_of)), None)),
             ):
-                if mine != theirs:
+                if mine is not None and mine != theirs:
                     raise InputError(
                         f"{name} and {members[0][0]} differ in {what}: {mine} and {theirs}; "
                         "evaluate them one at a time"

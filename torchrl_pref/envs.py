@@ -16,7 +16,7 @@ work and one environment serves any batch:
 ``action_mask`` (B C)                 ``QueryEnv``: candidates that may be asked
 ``offer`` (B K D)                     ``FeedEnv``: features of the offered query
 ``n_asked``, ``n_offered`` (B 1)      counts so far (``n_offered`` only in ``FeedEnv``)
-``human`` (omega, noise)              hidden: a strategy must not read it
+``human`` (omega, noise, care)        hidden: a strategy must not read it
 ``history`` (queries, answers)        (B H) pool indices and chosen options, -1 where open
 ``offers`` (B O), ``candidates`` …    pool indices of the stream or of the candidates
 ``metrics``                           alignment, alignment_of_mean, information, ess (B 1)
@@ -173,12 +173,9 @@ class SessionEnv(EnvBase):
         return state
 
     def _finish(
-        self, state: TensorDict, reward: Tensor, truncated: Tensor | None = None
+        self, state: TensorDict, reward: Tensor, truncated: Tensor, terminated: Tensor
     ) -> TensorDict:
         """Add reward and done flags to the observed next state."""
-        terminated = state["n_asked"] >= self.budget
-        if truncated is None:
-            truncated = torch.zeros_like(terminated)
         flags = {
             "reward": reward,
             "terminated": terminated,
@@ -277,17 +274,18 @@ class QueryEnv(SessionEnv):
         asked = tensordict["n_asked"].squeeze(-1) < self.budget
         state = self._observe(self._ask(tensordict, index, gain, asked))
         reward = self._objective.potential(state) - self._objective.potential(tensordict)
-        return self._finish(state, reward)
+        terminated = state["n_asked"] >= self.budget
+        return self._finish(state, reward, torch.zeros_like(terminated), terminated)
 
 
 class FeedEnv(SessionEnv):
     r"""The paper's second formulation: queries stream by, ask or skip (section 3.4).
 
     State: the belief and the offered query. Action: 1 asks, 0 skips. The episode ends at H asked
-    queries and is truncated at O offered ones. Reward, by ``skip``: with ``regret``, the paper's,
-    asking is worth what the offer is expected to add to the objective, r, and skipping costs it:
-    -r. With ``free``, asking is worth what the answer does add and skipping is worth nothing: what
-    is scarce is the H asks.
+    queries or O offered ones. Reward, by ``skip``: with ``regret``, the paper's, asking is worth
+    what the offer is expected to add to the objective, r, and skipping costs it: -r; running out of
+    offers truncates. With ``free``, asking is worth what the answer does add and skipping is worth
+    nothing: what is scarce is the H asks, and running out of offers is an end as any other.
 
     Args:
         pool: the queries, normalised. Offers are drawn from it independently and uniformly.
@@ -367,7 +365,14 @@ class FeedEnv(SessionEnv):
             query, model = self.features[index].unsqueeze(1), self.belief.response_model
             worth = self._objective.forecast(tensordict, query, model) * going_on
             reward = torch.where(asks, worth, -worth)
-        return self._finish(state, reward, truncated=state["n_offered"] >= self.n_offers)
+        out_of_offers = state["n_offered"] >= self.n_offers
+        terminated = state["n_asked"] >= self.budget
+        if self.skip == "free":
+            # Scarce offers are part of the task, and nothing is to come after the last.
+            return self._finish(
+                state, reward, torch.zeros_like(terminated), terminated | out_of_offers
+            )
+        return self._finish(state, reward, out_of_offers, terminated)
 
 
 def _spec_of(state: TensorDictBase) -> Composite:

@@ -73,6 +73,8 @@ def make_pools(settings: Settings) -> tuple[QueryPool, QueryPool]:
         )
     # Each pool takes two seeds, one for the starts and one for the moves.
     first_seed = 4 * check_seed("pool.seed", pool["seed"])
+    if first_seed >= 2**31:
+        raise InputError(f"pool.seed={pool['seed']}: expected a whole number below {2**29}")
     pools = []
     for path, seed in ((pool["train"], first_seed), (pool["test"], first_seed + 2)):
         if path is not None:

@@ -9,10 +9,11 @@ seeds: humans of one pool share it, and policies of one training share that.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from multiprocessing import get_context
 from typing import NamedTuple
@@ -123,7 +124,9 @@ def run_protocol(
     jobs = []
     for cell, checkpoints in learned.items():
         for checkpoint in checkpoints:
-            _check_fits(settings, cell, checkpoint)
+            _check_fits(settings, cell, checkpoint, checkpoints[0])
+        # The state of the training is of no use to a worker.
+        checkpoints = [replace(checkpoint, training={}) for checkpoint in checkpoints]
         # What a policy is made of depends on its objective; what it is judged by does not.
         own = {key: checkpoints[0].settings[key] for key in ("objective", "skip")}
         jobs += [Job({**settings, **own}, cell, pool, checkpoints) for pool in range(POOLS)]
@@ -131,9 +134,13 @@ def run_protocol(
             cell = cell._replace(features="balanced")
             pools = range(BALANCED_POOLS)
             jobs += [Job({**settings, **own}, cell, pool, checkpoints) for pool in pools]
-    with ProcessPoolExecutor(workers, get_context("spawn")) as executor:
+    # One file descriptor for each tensor that is passed would be too many for some systems.
+    torch.multiprocessing.set_sharing_strategy("file_system")
+    context = get_context("spawn")
+    with ProcessPoolExecutor(workers, context, _start_worker) as executor:
         taus = list(dict.fromkeys(cell.tau for cell in learned if cell.setup == "feed"))
-        fits = [Job(settings, Cell("feed", tau), 0, (), THRESHOLDS) for tau in taus]
+        feeds = {job.cell.tau: job.settings for job in jobs if job.cell.setup == "feed"}
+        fits = [Job(feeds[tau], Cell("feed", tau), 0, (), THRESHOLDS) for tau in taus]
         best = {
             job.cell.tau: THRESHOLDS[int(alignment.argmax())]
             for job, alignment in zip(fits, executor.map(_fit_threshold, fits), strict=True)
@@ -151,19 +158,38 @@ def run_protocol(
     return {cell: _gather(pools) for cell, pools in done.items()}
 
 
+def _start_worker() -> None:
+    """One thread for each worker, and tensors passed as files."""
+    torch.set_num_threads(1)
+    torch.multiprocessing.set_sharing_strategy("file_system")
+
+
 def two_way_interval(values: Tensor, resamples: int = 4000) -> tuple[float, float]:
-    """Bootstrap 95% interval of the mean of values (P S) over pools and seeds, drawn apart."""
+    """Bootstrap interval of the mean of values (P S) over pools and seeds, drawn apart.
+
+    Nominally 95%. Resampling P things shows (P - 1)/P of their variance, which is made up for; even
+    so the interval covers somewhat less, and much less where P is 3.
+    """
     generator = Generator().manual_seed(0)
     n_pools, n_seeds = values.shape
     pools = torch.randint(n_pools, (resamples, n_pools), generator=generator)
     seeds = torch.randint(n_seeds, (resamples, n_seeds), generator=generator)
     means = values[pools.unsqueeze(-1), seeds.unsqueeze(-2)].mean((1, 2))
-    low, high = torch.quantile(means, torch.tensor([0.025, 0.975])).tolist()
+    centre, widen = values.mean(), math.sqrt(n_pools / max(1, n_pools - 1))
+    bounds = torch.quantile(means, torch.tensor([0.025, 0.975]))
+    low, high = (centre + widen * (bounds - centre)).tolist()
     return low, high
 
 
-def _check_fits(settings: Settings, cell: Cell, checkpoint: Checkpoint) -> None:
-    """Refuse a policy that cannot be run on other pools, or was made for another task."""
+def _check_fits(settings: Settings, cell: Cell, checkpoint: Checkpoint, first: Checkpoint) -> None:
+    """Refuse a policy that cannot be run on other pools, or is no training seed of the first."""
+    for key in ("policy", "objective", "skip", "setup", "belief", "training", "tau_spread", "pool"):
+        mine, theirs = checkpoint.settings[key], first.settings[key]
+        if mine != theirs:
+            raise InputError(
+                f"protocol=heldout: policies of a {cell.setup} cell differ in {key}: {mine} and "
+                f"{theirs}; expected trainings that differ in seed alone; give one kind at a time"
+            )
     if checkpoint.picks_by_index:
         raise InputError(
             "protocol=heldout: policy=paper in the query setup picks indices of its training pool, "
@@ -182,7 +208,7 @@ def _task_and_pool(job: Job) -> tuple[Task, QueryPool]:
     settings = job.settings
     train, _ = make_pools(settings)
     grid, pool = settings["grid"], settings["pool"]
-    # No training pool has a seed this large; a pool takes two.
+    # Training pools have seeds below 2³¹; a pool takes two.
     seed = FIRST_EVALUATION_SEED + 2 * job.pool
     test = gridworld_pool(pool["size"], pool["options"], grid["size"], grid["length"], seed)
     if job.cell.features == "balanced":
@@ -244,7 +270,6 @@ def run_side_by_side(
 
 def _run_pool(job: Job) -> dict[str, list[Evaluation]]:
     """Every strategy of a cell on one pool; a list holds one evaluation for each training seed."""
-    torch.set_num_threads(1)
     task, pool = _task_and_pool(job)
     # A seed of its own for each pool, out of reach of any training.
     seed = FIRST_EVALUATION_SEED + 1000 + job.pool
@@ -266,7 +291,8 @@ def _run_pool(job: Job) -> dict[str, list[Evaluation]]:
         setup = {**job.settings["setup"], "repeats": False}
         unrepeated = partial(make_env, settings={**job.settings, "setup": setup})
         found |= run_side_by_side(unrepeated, humans, greedy)
-        greedy = {f"greedy information, M={FINE_SAMPLES}": Greedy(task.response_model)}
+        name = f"greedy information, M={FINE_SAMPLES} ({FINE_HUMANS} humans a pool)"
+        greedy = {name: Greedy(task.response_model)}
         belief = {**job.settings["belief"], "samples": FINE_SAMPLES}
         fine = partial(make_env, settings={**job.settings, "belief": belief})
         found |= run_side_by_side(fine, humans[:FINE_HUMANS].select("human"), greedy)
@@ -299,7 +325,6 @@ def _baselines(
 
 def _fit_threshold(job: Job) -> Tensor:
     """Final alignment of each threshold on the training pool, (thresholds)."""
-    torch.set_num_threads(1)
     task, _ = _task_and_pool(job)
 
     def make_env(sessions: int) -> FeedEnv:

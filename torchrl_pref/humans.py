@@ -32,9 +32,11 @@ class SimulatedHuman:
 
     def __init__(self, response_model: ResponseModel, spread: float = 1.0) -> None:
         self.response_model = response_model
-        self.spread = check_positive("spread", spread)
+        self.spread = check_positive("tau_spread", spread)
         if spread < 1:
-            raise InputError(f"spread={spread}: expected a factor of at least 1; 1 is no spread")
+            raise InputError(
+                f"tau_spread={spread}: expected a factor of at least 1; 1 is no spread"
+            )
 
     def draw(
         self, n_sessions: int, budget: int, n_options: int, n_features: int, generator: Generator

@@ -58,7 +58,7 @@ class Alignment(Objective):
 
     def potential(self, session: TensorDictBase) -> Tensor:
         """See :meth:`Objective.potential`."""
-        return session["mean"].square().sum(-1, keepdim=True)
+        return session["samples"].mean(1).square().sum(-1, keepdim=True)
 
     def forecast(
         self, session: TensorDictBase, queries: Tensor, response_model: ResponseModel
@@ -98,7 +98,11 @@ class Entropy(Objective):
     def potential(self, session: TensorDictBase) -> Tensor:
         """See :meth:`Objective.potential`."""
         samples = session["samples"]
-        nearest = torch.cdist(samples, samples).topk(4, largest=False).values[..., -1]
+        nearest = (
+            torch.cdist(samples, samples, compute_mode="donot_use_mm_for_euclid_dist")
+            .topk(4, largest=False)
+            .values[..., -1]
+        )
         bits = nearest.clamp(min=1e-7).log2().mean(-1, keepdim=True)
         return -(samples.shape[-1] - 1) * bits
 

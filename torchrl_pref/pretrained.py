@@ -38,13 +38,14 @@ def pretrained_policy(env: QueryEnv | FeedEnv, tau: str, seed: int = 0) -> Polic
     """A trained scorer for an environment: any pool, any number of options and features.
 
     Args:
-        env: where it is to ask, made with ``objective="alignment"``; a feed with ``skip="free"``.
+        env: where it is to ask; a feed made with ``skip="free"``, which is what it was trained for.
         tau: ``noisy`` or ``optimal``, the human it was trained with.
         seed: of its training, 0 to 4.
     """
     setup = "feed" if isinstance(env, FeedEnv) else "query"
-    policy = scorer_policy(env)
-    policy.weights.load_state_dict(pretrained_checkpoint(setup, tau, seed).weights)
+    checkpoint = pretrained_checkpoint(setup, tau, seed)
+    policy = scorer_policy(env, start=checkpoint.settings["objective"])
+    policy.weights.load_state_dict(checkpoint.weights)
     return policy
 
 

@@ -37,7 +37,7 @@ STYLE = {
 NAMES = {
     "greedy": "greedy information gain",
     "ask all": "ask all (feed)",
-    "quantile": "best quantile (feed)",
+    "quantile": "quantile rule (feed)",
 }
 
 

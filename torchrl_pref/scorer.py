@@ -64,7 +64,8 @@ class CandidateFeatures(nn.Module):
         now = mean.square().sum(-1, keepdim=True)
         length = centred.square().sum((-2, -1)).sqrt()
         return torch.stack(
-            [gain, alignment - now, removal, variance.sqrt(), variance, apart, length], -1
+            [gain, alignment - now, removal, variance.clamp(min=0).sqrt(), variance, apart, length],
+            -1,
         )
 
 

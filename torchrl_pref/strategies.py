@@ -91,7 +91,7 @@ class Lookahead(TensorDictModuleBase):
         beam: first steps to follow.
     """
 
-    in_keys = ["samples", "queries", "action_mask"]
+    in_keys = ["samples", "queries", "action_mask", ("history", "queries")]
     out_keys = ["action"]
 
     def __init__(self, response_model: ResponseModel, beam: int = 20) -> None:
@@ -113,13 +113,15 @@ class Lookahead(TensorDictModuleBase):
         probs = predicted.probs[0]  # (C M R)
         entropy = torch.special.entr(probs).sum(-1)
         value, first = gain.topk(min(self.beam, len(gain)))
+        if (session["history", "queries"] < 0).sum() <= 1:  # no second step after the last
+            return first[0]
         joint = probs[first].mT / probs.shape[1]  # (beam R M): P(answer and sample)
         of_answer = joint.sum(-1, keepdim=True)
         weights = joint / of_answer.clamp(min=1e-30)
         later = torch.stack([weights @ answer.T for answer in probs.unbind(-1)])
         # (beam R C), information gain of every second query after every first answer
         second = torch.special.entr(later).sum(0) - weights @ entropy.T
-        best = second.amax(-1) / math.log(2)
+        best = second.masked_fill(~session["action_mask"], 0.0).amax(-1) / math.log(2)
         return first[(value + (of_answer.squeeze(-1) * best).sum(-1)).argmax()]
 
 

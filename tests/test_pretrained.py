@@ -45,5 +45,10 @@ def test_they_work_on_any_pool(kind: type, shape: tuple[int, ...], generator: Ge
 def test_unknown_policies_are_refused() -> None:
     with pytest.raises(InputError, match="tau='loud'"):
         pretrained_checkpoint("query", "loud")
-    with pytest.raises(InputError, match="no such file"):
+    with pytest.raises(InputError, match="seed=99: expected a whole number from 0 to 4"):
         pretrained_checkpoint("query", "noisy", 99)
+    model = Boltzmann(3.0)
+    pool = QueryPool(torch.rand(9, 2, 4))
+    feed = FeedEnv(pool, SimulatedHuman(model), Belief(model), batch_size=(2,))
+    with pytest.raises(InputError, match="skip='regret'"):
+        pretrained_policy(feed, "noisy")

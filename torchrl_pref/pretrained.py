@@ -9,7 +9,7 @@ from pathlib import Path
 
 from torchrl_pref.checkpoint import FILE_NAME, Checkpoint
 from torchrl_pref.envs import FeedEnv, QueryEnv
-from torchrl_pref.errors import check_choice, check_count
+from torchrl_pref.errors import InputError, check_choice, check_count
 from torchrl_pref.policies import Policy, scorer_policy
 
 FOLDER = Path(__file__).parent / "pretrained"
@@ -30,7 +30,8 @@ def pretrained_checkpoint(setup: str, tau: str, seed: int = 0) -> Checkpoint:
     """
     check_choice("setup", setup, ("query", "feed"))
     check_choice("tau", tau, ("noisy", "optimal"))
-    check_count("seed", seed, 0)
+    if check_count("seed", seed, 0) >= SEEDS:
+        raise InputError(f"seed={seed}: expected a whole number from 0 to {SEEDS - 1}")
     return Checkpoint.load(FOLDER / f"{setup}-{tau}-{seed}.pt")
 
 
@@ -41,8 +42,16 @@ def pretrained_policy(env: QueryEnv | FeedEnv, tau: str, seed: int = 0) -> Polic
         env: where it is to ask; a feed made with ``skip="free"``, which is what it was trained for.
         tau: ``noisy`` or ``optimal``, the human it was trained with.
         seed: of its training, 0 to 4.
+
+    Raises:
+        InputError: there is no such policy, or the feed's skips are not free.
     """
     setup = "feed" if isinstance(env, FeedEnv) else "query"
+    if isinstance(env, FeedEnv) and env.skip != "free":
+        raise InputError(
+            f"skip={env.skip!r}: a pretrained feed policy was trained with free skips and a budget "
+            'of asks; make the environment with skip="free"'
+        )
     checkpoint = pretrained_checkpoint(setup, tau, seed)
     policy = scorer_policy(env, start=checkpoint.settings["objective"])
     policy.weights.load_state_dict(checkpoint.weights)

@@ -45,6 +45,11 @@ def job(config: DictConfig) -> None:
             app.use_threads(settings)
             named = settings["checkpoint"]
             check_lists(settings)
+            if app.was_typed("objective"):
+                raise InputError(
+                    "objective=… is what a policy is trained for and changes nothing here; expected "
+                    "by train.py; remove it"
+                )
             if settings["protocol"] is not None:
                 check_choice("protocol", settings["protocol"], ("heldout",))
                 app.refuse_other_overrides("protocol", PROTOCOL_KEYS)

@@ -250,6 +250,7 @@ BAD_INPUT = [
     ("evaluate", "policy=scorer", "policy='scorer': expected one of pretrained"),
     ("evaluate", "policy=pretrained checkpoint=x", "name two policies"),
     ("evaluate", "protocol=heldout setup=query", "setup=query: protocol=… brings its own"),
+    ("evaluate", "objective=entropy", "objective=… is what a policy is trained for"),
     ("evaluate", "tau=[]", "tau=[]: expected at least one"),
     ("evaluate", "checkpoint=[]", "checkpoint=[]: expected at least one"),
     ("train", "policy=pretrained", "policy='pretrained': expected one of scorer"),

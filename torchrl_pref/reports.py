@@ -92,7 +92,7 @@ def detail_table(results: Results, style: str = "simple") -> str:
             ]
         )
     headers = ["strategy", "mean of cosines", "cosine of mean", "bits", "ESS"]
-    headers += ["asked", "offered", "repeated", "ms a query"]
+    headers += ["asked", "offered", "repeated", "ms an ask"]
     return tabulate(rows, headers, tablefmt=style, disable_numparse=True)
 
 

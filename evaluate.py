@@ -47,8 +47,8 @@ def job(config: DictConfig) -> None:
             check_lists(settings)
             if app.was_typed("objective"):
                 raise InputError(
-                    "objective=… is what a policy is trained for and changes nothing here; expected "
-                    "by train.py; remove it"
+                    "objective=… is what a policy is trained for and changes nothing here; "
+                    "expected by train.py alone; remove it"
                 )
             if settings["protocol"] is not None:
                 check_choice("protocol", settings["protocol"], ("heldout",))

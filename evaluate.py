@@ -6,6 +6,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -20,15 +22,11 @@ from torchrl_pref.errors import InputError, check_choice, check_count, one_line_
 from torchrl_pref.pretrained import SEEDS, pretrained_checkpoint
 from torchrl_pref.queries import QueryPool
 
-PROTOCOL_KEYS: tuple[str, ...] = (
-    "checkpoint",
-    "workers",
-    "device",
-    "threads",
-    "setup.budget",
-    "setup.offers",
+PROTOCOL_KEYS = (
+    *("checkpoint", "workers", "device", "threads", "hydra."),
+    *("setup.budget", "setup.offers", "belief.", "grid."),
+    *("pool.size", "pool.options", "pool.seed"),
 )
-PROTOCOL_KEYS += ("belief.", "grid.", "pool.size", "pool.options", "pool.seed", "hydra.")
 """What may be typed beside ``protocol``; the rest is the protocol's own."""
 
 Evaluated = tuple[comparison.Panels, dict[str, dict[str, list[float]]]]
@@ -61,9 +59,10 @@ def job(config: DictConfig) -> None:
                         "policy=pretrained and checkpoint=… name two policies; expected one of "
                         "them; pretrained policies are files too: checkpoint=[a.pt,b.pt]"
                     )
-                reports.write_report(folder, *evaluate_pretrained(settings))
+                panels = evaluate_taus(settings, partial(pretrained_for, settings))
+                reports.write_report(folder, panels, {})
             elif named is None:
-                reports.write_report(folder, evaluate_baselines(settings), {})
+                reports.write_report(folder, evaluate_taus(settings, lambda tau: {}), {})
             else:
                 allowed = ("evaluation.", "pool.test", "device", "threads", "hydra.")
                 app.refuse_other_overrides("checkpoint", allowed)
@@ -89,28 +88,25 @@ def listed(value: Any) -> list[Any]:
     return value if isinstance(value, list) else [value]
 
 
-def evaluate_baselines(settings: dict[str, Any]) -> comparison.Panels:
-    """Random and greedy, a panel for each tau."""
+def evaluate_taus(
+    settings: dict[str, Any], learned_for: Callable[[Any], dict[str, Checkpoint]]
+) -> comparison.Panels:
+    """The baselines and what was learned for each tau, a panel each."""
     pools = experiment.make_pools(settings)
+    taus = listed(settings["tau"])
+    tasks = [(experiment.make_task(*pools, tau), learned_for(tau)) for tau in taus]
     panels: comparison.Panels = {}
-    for task in [experiment.make_task(*pools, tau) for tau in listed(settings["tau"])]:
-        panels |= comparison.evaluate_panels(settings, task, {})
+    for task, learned in tasks:
+        panels |= comparison.evaluate_panels(settings, task, learned)
     return panels
 
 
-def evaluate_pretrained(settings: dict[str, Any]) -> Evaluated:
-    """The policies that come with the package beside the baselines, a panel for each tau."""
-    pools = experiment.make_pools(settings)
-    setup = settings["setup"]["name"]
-    panels: comparison.Panels = {}
-    for tau in listed(settings["tau"]):
-        checkpoint = pretrained_checkpoint(setup, tau)
-        for section in ("setup", "belief", "skip", "tau_spread", "device"):
-            checkpoint.settings[section] = settings[section]
-        label = f"{comparison.label_of(checkpoint.settings)} (pretrained)"
-        task = experiment.make_task(*pools, tau)
-        panels |= comparison.evaluate_panels(settings, task, {label: checkpoint})
-    return panels, {}
+def pretrained_for(settings: dict[str, Any], tau: Any) -> dict[str, Checkpoint]:
+    """The policy that comes with the package for a tau, under the settings of this evaluation."""
+    checkpoint = pretrained_checkpoint(settings["setup"]["name"], tau)
+    for section in ("setup", "belief", "skip", "tau_spread", "device"):
+        checkpoint.settings[section] = settings[section]
+    return {f"{comparison.label_of(checkpoint.settings)} (pretrained)": checkpoint}
 
 
 def run_heldout(settings: dict[str, Any], folder: Path) -> None:

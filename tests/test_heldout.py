@@ -147,8 +147,7 @@ def test_whole_protocol(monkeypatch: pytest.MonkeyPatch) -> None:
     learned = {}
     for setup in ("query", "feed"):
         learned[Cell(setup, "noisy")] = [checkpoint_of({**settings_of(setup), "seed": 3})]
-    both = {**settings_of("feed"), "setup": {**settings_of("feed")["setup"]}}
-    results = run_protocol(both, learned, 1)
+    results = run_protocol(settings_of("feed"), learned, 1)
     assert set(results) == {
         Cell("query", "noisy"),
         Cell("query", "noisy", "balanced"),

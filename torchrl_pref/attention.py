@@ -65,3 +65,12 @@ class AttentionScorer(nn.Module):
         shares = shares.unsqueeze(1).expand(-1, seen.shape[1], -1)
         hidden = self.head(torch.cat([shown, seen, shares], -1)).tanh()
         return self.value(hidden.unflatten(1, (candidates, options)).sum(2)).squeeze(-1)
+
+
+class OfferAttention(AttentionScorer):
+    """The logits of skip and ask from the score of the one candidate that is offered."""
+
+    def forward(self, samples: Tensor, offer: Tensor, shares: Tensor) -> Tensor:
+        """From samples (B M D), offer (B K D) and shares (B s) to logits (B 2)."""
+        ask = super().forward(samples, offer.unsqueeze(1), shares)
+        return torch.cat([torch.zeros_like(ask), ask], -1)

@@ -17,9 +17,8 @@ from torchrl_pref.evaluation import Evaluation, draw_humans, evaluate
 from torchrl_pref.experiment import (
     Settings,
     Task,
-    load_weights,
+    load_policy,
     make_feed_env,
-    make_policy,
     make_query_env,
 )
 from torchrl_pref.policies import Policy
@@ -125,9 +124,7 @@ def _load_policy(
     settings = checkpoint.settings
     make = make_feed_env if settings["setup"]["name"] == "feed" else make_query_env
     env = make(settings, task, pool, n_humans, seed)
-    policy = make_policy(settings, env)
-    load_weights(policy, checkpoint)
-    return env, policy
+    return env, load_policy(checkpoint, env)
 
 
 def _feed_of(checkpoint: Checkpoint) -> tuple[Any, Any] | None:

@@ -39,7 +39,7 @@ from torch.nn import functional as F
 from torchrl.data import Binary, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_pref.acquisition import information_gain, predict_answers
+from torchrl_pref.acquisition import information_gain, score_queries
 from torchrl_pref.belief import Belief, feature_gaps
 from torchrl_pref.errors import InputError, check_choice, check_count, check_flag
 from torchrl_pref.humans import SimulatedHuman
@@ -142,9 +142,8 @@ class SessionEnv(EnvBase):
 
     def _information(self, tensordict: TensorDictBase, index: Tensor) -> Tensor:
         """(B 1), information gain in bits of pool query ``index`` (B) under the belief."""
-        samples, queries = tensordict["samples"], self.features[index].unsqueeze(1)
-        predicted = predict_answers(samples, queries, self.belief.response_model)
-        return information_gain(predicted, samples)
+        queries, model = self.features[index].unsqueeze(1), self.belief.response_model
+        return score_queries(tensordict["samples"], queries, model, information_gain)
 
     def _ask(
         self, tensordict: TensorDictBase, index: Tensor, information: Tensor, asked: Tensor
@@ -369,9 +368,7 @@ class FeedEnv(SessionEnv):
         terminated = state["n_asked"] >= self.budget
         if self.skip == "free":
             # Scarce offers are part of the task, and nothing is to come after the last.
-            return self._finish(
-                state, reward, torch.zeros_like(terminated), terminated | out_of_offers
-            )
+            terminated = terminated | out_of_offers
         return self._finish(state, reward, out_of_offers, terminated)
 
 

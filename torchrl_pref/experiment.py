@@ -207,7 +207,9 @@ def make_policy(settings: Settings, env: QueryEnv | FeedEnv) -> Policy:
     name = check_choice("policy", chosen["name"], ("scorer", "attention", "paper"))
     if name == "attention":
         return attention_policy(env, chosen["tokens"])
-    return paper_policy(env) if name == "paper" else scorer_policy(env, chosen["start"])
+    if name == "paper":
+        return paper_policy(env)
+    return scorer_policy(env, chosen["start"] or settings["objective"])
 
 
 def make_checkpoint(settings: Settings, task: Task, trainer: Trainer) -> Checkpoint:
@@ -257,3 +259,14 @@ def load_weights(policy: Policy, checkpoint: Checkpoint) -> None:
         policy.weights.load_state_dict(checkpoint.weights)
     except RuntimeError as error:
         raise InputError(f"the checkpoint's weights do not fit this run: {error}") from error
+
+
+def load_policy(checkpoint: Checkpoint, env: QueryEnv | FeedEnv) -> Policy:
+    """A trained policy, to fit an environment.
+
+    Raises:
+        InputError: its weights do not fit.
+    """
+    policy = make_policy(checkpoint.settings, env)
+    load_weights(policy, checkpoint)
+    return policy

@@ -13,7 +13,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context
 from typing import NamedTuple
@@ -33,9 +33,8 @@ from torchrl_pref.evaluation import Evaluation, draw_humans, evaluate
 from torchrl_pref.experiment import (
     Settings,
     Task,
-    load_weights,
+    load_policy,
     make_feed_env,
-    make_policy,
     make_pools,
     make_query_env,
     make_task,
@@ -52,9 +51,6 @@ from torchrl_pref.strategies import (
 )
 
 POOLS, BALANCED_POOLS, HUMANS = 10, 3, 100
-
-TENSORS = ("alignment", "alignment_of_mean", "information", "ess", "asked", "offered", "repeated")
-"""What an evaluation holds for each human."""
 
 FINE_SAMPLES, FINE_HUMANS = 4000, 5
 """Greedy with 40 times the samples is 40 times the work: it faces a few humans of each pool."""
@@ -102,7 +98,7 @@ class Job:
     cell: Cell
     pool: int
     learned: Sequence[Checkpoint] = ()
-    thresholds: Sequence[float] = field(default_factory=tuple)
+    thresholds: Sequence[float] = ()
 
 
 Results = dict[Cell, dict[str, Outcome]]
@@ -127,30 +123,23 @@ def run_protocol(
             _check_fits(settings, cell, checkpoint, checkpoints[0])
         # The state of the training is of no use to a worker.
         checkpoints = [replace(checkpoint, training={}) for checkpoint in checkpoints]
-        # What a policy is made of depends on its objective; what it is judged by does not.
-        own = {key: checkpoints[0].settings[key] for key in ("objective", "skip")}
-        jobs += [Job({**settings, **own}, cell, pool, checkpoints) for pool in range(POOLS)]
+        own = {**settings, "skip": checkpoints[0].settings["skip"]}
+        jobs += [Job(own, cell, pool, checkpoints) for pool in range(POOLS)]
         if cell.setup == "query":
             cell = cell._replace(features="balanced")
-            pools = range(BALANCED_POOLS)
-            jobs += [Job({**settings, **own}, cell, pool, checkpoints) for pool in pools]
+            jobs += [Job(own, cell, pool, checkpoints) for pool in range(BALANCED_POOLS)]
     # One file descriptor for each tensor that is passed would be too many for some systems.
     torch.multiprocessing.set_sharing_strategy("file_system")
     context = get_context("spawn")
     with ProcessPoolExecutor(workers, context, _start_worker) as executor:
-        taus = list(dict.fromkeys(cell.tau for cell in learned if cell.setup == "feed"))
-        feeds = {job.cell.tau: job.settings for job in jobs if job.cell.setup == "feed"}
-        fits = [Job(feeds[tau], Cell("feed", tau), 0, (), THRESHOLDS) for tau in taus]
+        feeds = {job.cell: job for job in jobs if job.cell.setup == "feed"}
+        fits = [replace(job, learned=(), thresholds=THRESHOLDS) for job in feeds.values()]
+        alignments = executor.map(_fit_threshold, fits)
         best = {
-            job.cell.tau: THRESHOLDS[int(alignment.argmax())]
-            for job, alignment in zip(fits, executor.map(_fit_threshold, fits), strict=True)
+            cell: (THRESHOLDS[int(alignment.argmax())],)
+            for cell, alignment in zip(feeds, alignments, strict=True)
         }
-        jobs = [
-            Job(job.settings, job.cell, job.pool, job.learned, (best[job.cell.tau],))
-            if job.cell.setup == "feed"
-            else job
-            for job in jobs
-        ]
+        jobs = [replace(job, thresholds=best.get(job.cell, ())) for job in jobs]
         rows = tqdm(executor.map(_run_pool, jobs), total=len(jobs), desc="pools", unit="pool")
         done: dict[Cell, list[dict[str, list[Evaluation]]]] = {}
         for job, row in zip(jobs, rows, strict=True):
@@ -262,9 +251,9 @@ def run_side_by_side(
     results = {}
     for number, name in enumerate(strategies):
         rows = slice(number * count, (number + 1) * count)
-        tensors = {key: value[rows] for key, value in vars(whole).items() if key in TENSORS}
-        seconds = chorus.seconds[number] / max(1, int(tensors["asked"].sum()))
-        results[name] = Evaluation(**tensors, seconds_per_query=seconds)
+        own = {key: value[rows] for key, value in vars(whole).items() if isinstance(value, Tensor)}
+        seconds = chorus.seconds[number] / max(1, int(own["asked"].sum()))
+        results[name] = replace(whole, **own, seconds_per_query=seconds)
     return results
 
 
@@ -282,9 +271,7 @@ def _run_pool(job: Job) -> dict[str, list[Evaluation]]:
     humans = draw_humans(env)
     strategies = _baselines(job, task, env, seed)
     for number, checkpoint in enumerate(job.learned):
-        policy = make_policy(checkpoint.settings, env)
-        load_weights(policy, checkpoint)
-        strategies[f"RL {number}"] = policy.strategy
+        strategies[f"RL {number}"] = load_policy(checkpoint, env).strategy
     found = run_side_by_side(make_env, humans, strategies)
     if job.cell.setup == "query" and job.cell.features == "corners":
         greedy = {"greedy information, no repeats": Greedy(task.response_model)}

@@ -8,16 +8,14 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-import matplotlib
 import torch
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
 from tabulate import tabulate
 from torch import Tensor
 
-from torchrl_pref.heldout import Cell, Outcome, Results, two_way_interval
-
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
-from matplotlib.axes import Axes
+from torchrl_pref.heldout import Outcome, Results, two_way_interval
+from torchrl_pref.reports import draw_band, save_figure, signed
 
 COLORS = {
     "RL": "#0072b2",
@@ -49,7 +47,7 @@ def reaches(outcome: Outcome, level: float) -> str:
     return str(int(enough[0])) if len(enough) else "never"
 
 
-def cell_table(cell: Cell, outcomes: dict[str, Outcome], style: str = "simple") -> str:
+def cell_table(outcomes: dict[str, Outcome]) -> str:
     """One strategy a row, and the paired differences of the policies to it."""
     budget = next(iter(outcomes.values())).alignment.shape[-1] - 1
     half = max(1, budget // 2)
@@ -65,7 +63,7 @@ def cell_table(cell: Cell, outcomes: dict[str, Outcome], style: str = "simple") 
             f"after {budget}": f"{values[..., -1].mean():.3f}",
             f"mean of 1 to {budget}": f"{values[..., 1:].mean():.3f}",
         }
-        if name == "RL" or "RL" not in outcomes:
+        if name == "RL":
             row["RL minus it, last"] = row["RL minus it, mean"] = ""
         else:
             gap = paired(outcomes["RL"], outcome)
@@ -77,7 +75,7 @@ def cell_table(cell: Cell, outcomes: dict[str, Outcome], style: str = "simple") 
         row["repeats"] = f"{outcome.repeated.mean():.1f}"
         row["ms to choose"] = f"{1000 * outcome.seconds.mean():.2f}"
         rows.append(row)
-    return tabulate(rows, headers="keys", tablefmt=style, disable_numparse=True)
+    return tabulate(rows, headers="keys", disable_numparse=True)
 
 
 def write_heldout(folder: Path, results: Results) -> None:
@@ -90,7 +88,7 @@ def write_heldout(folder: Path, results: Results) -> None:
             f"{cell.title}: alignment, {n_pools} pools of {n_humans} humans, {n_seeds} training "
             "seeds, [95% interval over pools and seeds]"
         )
-        parts += ["", cell_table(cell, outcomes), ""]
+        parts += ["", cell_table(outcomes), ""]
     text = "\n".join(parts)
     print("\n" + text)
     (folder / "heldout.txt").write_text(text)
@@ -124,24 +122,19 @@ def figure(results: Results, path: Path) -> None:
             axis.xaxis.get_major_locator().set_params(integer=True)
     axes[0, 0].set_ylabel("alignment")
     axes[1, 0].set_ylabel("difference")
-    fig.tight_layout()
-    fig.savefig(path, dpi=150)
-    plt.close(fig)
+    save_figure(fig, path)
 
 
 def _draw(axis: Axes, name: str, values: Tensor) -> None:
     """Mean and interval of curves (P S H+1)."""
     means = values.mean((0, 1))
     bounds = torch.tensor([two_way_interval(column) for column in values.unbind(-1)])
-    axis.plot(range(len(means)), means, color=COLORS[name], label=name, lw=1.5)
-    axis.fill_between(
-        range(len(means)), bounds[:, 0], bounds[:, 1], color=COLORS[name], alpha=0.15, lw=0
-    )
+    draw_band(axis, means, bounds, color=COLORS[name], label=name)
 
 
 def _interval(values: Tensor) -> str:
     """Mean and interval of values (P S)."""
-    return "{:+.3f} [{:+.3f}, {:+.3f}]".format(float(values.mean()), *two_way_interval(values))
+    return signed(float(values.mean()), two_way_interval(values))
 
 
 def _write_curves(results: Results, path: Path) -> None:

@@ -15,7 +15,12 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_pref.acquisition import expected_alignment, information_gain, predict_answers
+from torchrl_pref.acquisition import (
+    expected_alignment,
+    information_gain,
+    predict_answers,
+    score_queries,
+)
 from torchrl_pref.errors import check_choice
 from torchrl_pref.responses import ResponseModel
 
@@ -45,8 +50,7 @@ class InformationGain(Objective):
         self, session: TensorDictBase, queries: Tensor, response_model: ResponseModel
     ) -> Tensor:
         """See :meth:`Objective.forecast`."""
-        samples = session["samples"]
-        return information_gain(predict_answers(samples, queries, response_model), samples)
+        return score_queries(session["samples"], queries, response_model, information_gain)
 
 
 class Alignment(Objective):
@@ -64,9 +68,8 @@ class Alignment(Objective):
         self, session: TensorDictBase, queries: Tensor, response_model: ResponseModel
     ) -> Tensor:
         """See :meth:`Objective.forecast`."""
-        samples = session["samples"]
-        predicted = predict_answers(samples, queries, response_model)
-        return expected_alignment(predicted, samples) - self.potential(session)
+        later = score_queries(session["samples"], queries, response_model, expected_alignment)
+        return later - self.potential(session)
 
 
 class TrueAlignment(Objective):
@@ -110,8 +113,7 @@ class Entropy(Objective):
         self, session: TensorDictBase, queries: Tensor, response_model: ResponseModel
     ) -> Tensor:
         """The expected loss of entropy is the information gain."""
-        samples = session["samples"]
-        return information_gain(predict_answers(samples, queries, response_model), samples)
+        return score_queries(session["samples"], queries, response_model, information_gain)
 
 
 OBJECTIVES: dict[str, Objective] = {

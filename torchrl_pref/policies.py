@@ -12,10 +12,10 @@ from tensordict.nn import (
     TensorDictModuleBase,
     TensorDictSequential,
 )
-from torch import Tensor, nn
+from torch import nn
 from torchrl.modules import MLP, MaskedCategorical, ProbabilisticActor, ValueOperator
 
-from torchrl_pref.attention import TOKENS, AttentionScorer
+from torchrl_pref.attention import TOKENS, AttentionScorer, OfferAttention
 from torchrl_pref.envs import FeedEnv, QueryEnv
 from torchrl_pref.errors import check_choice
 from torchrl_pref.scorer import (
@@ -100,22 +100,11 @@ def attention_policy(env: QueryEnv | FeedEnv, tokens: str = "samples") -> Policy
     device = torch.device(env.device)
     check_choice("policy.tokens", tokens, TOKENS)
     n_shares = env.observation_spec["remaining"].shape[-1]
-    network = AttentionScorer(env.features.shape[-1], n_shares, tokens, device)
-
-    def ask_or_skip(samples: Tensor, offer: Tensor, shares: Tensor) -> Tensor:
-        ask = network(samples, offer.unsqueeze(1), shares)
-        return torch.cat([torch.zeros_like(ask), ask], -1)
-
-    logits: TensorDictModuleBase
-    if isinstance(env, QueryEnv):
-        logits = TensorDictModule(
-            network, in_keys=["samples", "queries", "remaining"], out_keys=["logits"]
-        )
-    else:
-        logits = TensorDictModule(
-            ask_or_skip, in_keys=["samples", "offer", "remaining"], out_keys=["logits"]
-        )
-        logits.network = network
+    kind, shown = (
+        (AttentionScorer, "queries") if isinstance(env, QueryEnv) else (OfferAttention, "offer")
+    )
+    network = kind(env.features.shape[-1], n_shares, tokens, device)
+    logits = TensorDictModule(network, in_keys=["samples", shown, "remaining"], out_keys=["logits"])
     _, critic = _belief_critic(n_shares, device)
     return Policy(None, _actor(logits, env), critic)
 

@@ -10,7 +10,8 @@ from pathlib import Path
 from torchrl_pref.checkpoint import FILE_NAME, Checkpoint
 from torchrl_pref.envs import FeedEnv, QueryEnv
 from torchrl_pref.errors import InputError, check_choice, check_count
-from torchrl_pref.policies import Policy, scorer_policy
+from torchrl_pref.experiment import load_policy
+from torchrl_pref.policies import Policy
 
 FOLDER = Path(__file__).parent / "pretrained"
 
@@ -52,10 +53,7 @@ def pretrained_policy(env: QueryEnv | FeedEnv, tau: str, seed: int = 0) -> Polic
             f"skip={env.skip!r}: a pretrained feed policy was trained with free skips and a budget "
             'of asks; make the environment with skip="free"'
         )
-    checkpoint = pretrained_checkpoint(setup, tau, seed)
-    policy = scorer_policy(env, start=checkpoint.settings["objective"])
-    policy.weights.load_state_dict(checkpoint.weights)
-    return policy
+    return load_policy(pretrained_checkpoint(setup, tau, seed), env)
 
 
 def export(sweep: str | Path) -> list[Path]:

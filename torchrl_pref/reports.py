@@ -8,6 +8,7 @@ import math
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import torch
@@ -98,7 +99,12 @@ def detail_table(results: Results, style: str = "simple") -> str:
 
 def _difference(paired: Tensor) -> str:
     """Mean and interval of a paired difference."""
-    return "{:+.3f} [{:+.3f}, {:+.3f}]".format(float(paired.mean()), *bootstrap_interval(paired))
+    return signed(float(paired.mean()), bootstrap_interval(paired))
+
+
+def signed(mean: float, interval: tuple[float, float]) -> str:
+    """A difference and its interval, as tables show them."""
+    return "{:+.3f} [{:+.3f}, {:+.3f}]".format(mean, *interval)
 
 
 def write_curves(panels: Mapping[str, Results], path: Path) -> None:
@@ -137,7 +143,7 @@ def figure_1(panels: Mapping[str, Results], path: Path) -> None:
     figure.supxlabel(
         f"{n_humans} humans, bands are 95% intervals", fontsize="small", color="#555555"
     )
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _draw_curve(axis: Axes, name: str, values: Tensor) -> None:
@@ -145,10 +151,15 @@ def _draw_curve(axis: Axes, name: str, values: Tensor) -> None:
     color, line = STYLE.get(name, (None, "-"))
     means = values.mean(0)
     intervals = torch.tensor([bootstrap_interval(column) for column in values.unbind(1)])
-    queries = range(len(means))
     # Dots go on top: a feed policy that asks everything lies exactly under "ask all".
     label, order = NAMES.get(name, name), 3 if line == ":" else 2
-    (drawn,) = axis.plot(queries, means, line, color=color, label=label, zorder=order)
+    draw_band(axis, means, intervals, linestyle=line, color=color, label=label, zorder=order)
+
+
+def draw_band(axis: Axes, means: Tensor, intervals: Tensor, **line: Any) -> None:
+    """A curve by number of queries (H+1) and its intervals (H+1 2); ``line`` is its style."""
+    queries = range(len(means))
+    (drawn,) = axis.plot(queries, means, **line)
     axis.fill_between(
         queries, intervals[:, 0], intervals[:, 1], color=drawn.get_color(), alpha=0.15, lw=0
     )
@@ -163,7 +174,7 @@ def figure_2(histories: Mapping[str, Sequence[float]], path: Path) -> None:
     axis.set(xlabel="A2C updates", ylabel="training episode length (offers)", xscale="log")
     axis.grid(alpha=0.25)
     axis.legend(frameon=False)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def training_figure(history: Mapping[str, Sequence[float]], path: Path) -> None:
@@ -175,7 +186,7 @@ def training_figure(history: Mapping[str, Sequence[float]], path: Path) -> None:
         label = name.removeprefix("train/").replace("_", " ")
         axis.set(xlabel="A2C updates", ylabel=label, title=f"{label}, mean over ended episodes")
         axis.grid(alpha=0.25)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def write_report(
@@ -267,7 +278,8 @@ def geometric_edges(count: int) -> list[int]:
     return edges
 
 
-def _save(figure: Figure, path: Path) -> None:
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure to a file and close it."""
     figure.tight_layout()
     figure.savefig(path, dpi=150)
     plt.close(figure)

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torchrl.modules import MLP
 
 from torchrl_pref.acquisition import (
+    Acquisition,
     expected_alignment,
     information_gain,
     rank_offer,
@@ -23,7 +24,7 @@ from torchrl_pref.belief import covariance_of
 from torchrl_pref.envs import FeedEnv
 from torchrl_pref.errors import check_choice
 from torchrl_pref.objectives import OBJECTIVES
-from torchrl_pref.responses import Prediction, ResponseModel
+from torchrl_pref.responses import ResponseModel
 from torchrl_pref.strategies import REFERENCE, asks_over_offers, reference_of
 
 N_CANDIDATE = 7
@@ -55,7 +56,10 @@ class CandidateFeatures(nn.Module):
         """From samples (B M D) and candidates (B C K D) to features (B C F)."""
         mean = samples.mean(1)
         gain, alignment, removal = score_queries(
-            samples, queries, self.response_model, _all_acquisitions
+            samples,
+            queries,
+            self.response_model,
+            _together(information_gain, expected_alignment, volume_removal),
         ).unbind(-1)
         centred = queries - queries.mean(-2, keepdim=True)
         covariance = covariance_of(samples)
@@ -69,15 +73,9 @@ class CandidateFeatures(nn.Module):
         )
 
 
-def _all_acquisitions(predicted: Prediction, samples: Tensor) -> Tensor:
-    """Information gain, expected alignment and volume removal, (B C 3)."""
-    functions = (information_gain, expected_alignment, volume_removal)
-    return torch.stack([function(predicted, samples) for function in functions], -1)
-
-
-def _gains(predicted: Prediction, samples: Tensor) -> Tensor:
-    """Information gain and expected alignment, (B C 2)."""
-    return _all_acquisitions(predicted, samples)[..., :2]
+def _together(*functions: Acquisition) -> Acquisition:
+    """Acquisition functions as one of several values, so that answers are predicted once."""
+    return lambda predicted, samples: torch.stack([f(predicted, samples) for f in functions], -1)
 
 
 def greedy_feature(objective: str) -> int:
@@ -169,7 +167,8 @@ class OfferFeatures(nn.Module):
         """From samples (B M D), offer (B K D) and counts (B 1) to offer features (B F), ranks of
         information and alignment gain (B 2), and asks left over offers left (B 1)."""
         model = self.features.response_model
-        ranks = rank_offer(samples, offer, self.reference, model, _gains)
+        gains = _together(information_gain, expected_alignment)
+        ranks = rank_offer(samples, offer, self.reference, model, gains)
         share = asks_over_offers(n_asked, n_offered, self.budget, self.n_offers)
         return self.features(samples, offer.unsqueeze(1)).squeeze(1), ranks, share
 

@@ -173,8 +173,8 @@ class ThresholdAsk(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` (B)."""
         samples, offer, n_asked, n_offered = (tensordict[key] for key in self.in_keys)
-        predicted = predict_answers(samples, offer.unsqueeze(1), self.response_model)
-        value = self.acquisition(predicted, samples)
+        queries = offer.unsqueeze(1)
+        value = score_queries(samples, queries, self.response_model, self.acquisition)
         share = asks_over_offers(n_asked, n_offered, self.budget, self.n_offers)
         ask = (value >= self.threshold) | (share >= 1)
         return tensordict.set("action", ask.squeeze(-1).long())

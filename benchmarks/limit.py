@@ -21,10 +21,17 @@ import torch
 from torch import Generator, Tensor
 
 from benchmarks import common
+from torchrl_pref import sampler_cpu
 from torchrl_pref.acquisition import information_gain, predict_answers, score_queries
-from torchrl_pref.belief import Belief, feature_gaps, uniform_sphere
+from torchrl_pref.belief import (
+    Belief,
+    covariance_of,
+    feature_gaps,
+    orthonormal,
+    uniform_sphere,
+)
 from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel
-from torchrl_pref.sampler import great_circle_step
+from torchrl_pref.sampler import ARC, MAX_SHRINKS
 
 SESSIONS = 100
 
@@ -108,21 +115,7 @@ def _compiled(
     return lambda: kernel(samples, queries), time.perf_counter() - start
 
 
-class _Counting:
-    """A response model that counts the answers it evaluates."""
-
-    def __init__(self, model: ResponseModel) -> None:
-        self.model, self.evaluated = model, 0
-
-    def joint_log_likelihood(self, gaps: Tensor) -> Tensor:
-        self.evaluated += gaps.numel()
-        return self.model.joint_log_likelihood(gaps)
-
-    def least_gap(self, log_likelihood: Tensor) -> Tensor:
-        return self.model.least_gap(log_likelihood)
-
-
-def _moving(model: ResponseModel, n_answers: int, repeats: int) -> common.Row:
+def _moving(model: Boltzmann | Optimal, n_answers: int, repeats: int) -> common.Row:
     """One Markov step of the belief after so many answers."""
     generator = Generator().manual_seed(0)
     pool = common.normalised_pool().features
@@ -137,21 +130,23 @@ def _moving(model: ResponseModel, n_answers: int, repeats: int) -> common.Row:
         newest = feature_gaps(queries, answers)
         samples, ess, _ = belief.update(samples, ess, gaps, newest, generator)
         gaps = torch.cat([gaps, newest.unsqueeze(1)], 1)
-    poles = torch.randn(samples.shape, generator=generator)
+    scale = torch.linalg.cholesky(covariance_of(samples))
+    poles = orthonormal(1, samples.shape, generator)[0] @ scale.mT
     slack = torch.zeros(SESSIONS)
-    counting = _Counting(model)
+    uniform = torch.rand((*samples.shape[:2], 2 + MAX_SHRINKS), generator=generator)
 
-    def step(model: ResponseModel = model) -> Tensor:
-        seeded = Generator().manual_seed(1)
-        return great_circle_step(samples, poles, gaps, slack, model, seeded)
+    def step(shrinks: int = MAX_SHRINKS) -> Tensor:
+        given = samples, poles, gaps, slack, uniform[..., : 2 + shrinks]
+        return sampler_cpu.great_circle_step(*given, ARC, *model.logistic)
 
-    step(counting)  # type: ignore[arg-type]
-    cases = {"ceiling": _ceiling(counting.evaluated, "cpu"), "step": step}
-    seconds = common.paired(cases, repeats)
+    # A sample that has not moved after so many shrinks needs one more evaluation.
+    unmoved = sum((step(n) - samples).norm(dim=-1) < 1e-6 for n in range(MAX_SHRINKS))
+    evaluated = n_answers * int((1 + unmoved).sum())
+    seconds = common.paired({"ceiling": _ceiling(evaluated, "cpu"), "step": step}, repeats)
     kind = "soft" if isinstance(model, Boltzmann) else "hard"
     return {
         "kernel": f"belief step, {kind}, H={n_answers}, S={SESSIONS}",
-        "elements": counting.evaluated,
+        "elements": evaluated,
         "CPU ms": 1000 * seconds["step"],
         "ceiling ms": 1000 * seconds["ceiling"],
         "ratio": seconds["step"] / seconds["ceiling"],

@@ -18,7 +18,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from torchrl_pref.sampler import MAX_SHRINKS
+from torchrl_pref.sampler import ARC, MAX_SHRINKS
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
 
@@ -102,10 +102,20 @@ def update(samples: Array, rows: Array, moves: int, rng: np.random.Generator) ->
     samples = samples[np.searchsorted(cumulative, points).clip(max=n_samples - 1)]
     centred = samples - samples.mean(0)
     covariance = centred.T @ centred / n_samples + 1e-6 * np.eye(rows.shape[1])
-    normal = rng.standard_normal((moves, *samples.shape))
-    for poles in normal @ np.linalg.cholesky(covariance).T:
-        samples = great_circle_step(samples, poles, rows, rng)
+    scale = np.linalg.cholesky(covariance)
+    for directions in orthonormal(moves, samples.shape, rng):
+        samples = great_circle_step(samples, directions @ scale.T, rows, rng)
     return samples
+
+
+def orthonormal(n: int, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
+    """Unit vectors (n M D) for a shape (M D), in frames of D at right angles."""
+    vectors = rng.standard_normal((n, *shape))
+    for i in range(n):
+        for j in range(i - i % shape[-1], i):
+            vectors[i] -= np.einsum("md,md->m", vectors[i], vectors[j])[:, None] * vectors[j]
+        vectors[i] = unit(vectors[i])
+    return vectors
 
 
 def great_circle_step(samples: Array, poles: Array, rows: Array, rng: np.random.Generator) -> Array:
@@ -124,7 +134,9 @@ def great_circle_step(samples: Array, poles: Array, rows: Array, rng: np.random.
 
     power = samples.shape[1] - 2
     threshold = density(circle[0].copy(), power) * rng.random(len(samples))
-    low, high = bracket(circle[:, :-1], np.log(1 / threshold - 1), rng)
+    arc = np.minimum(ARC * length, 2 * math.pi)
+    high = rng.random(len(samples)) * arc
+    low = high - arc
     angle, todo = np.zeros(len(samples)), np.arange(len(samples))
     for _ in range(MAX_SHRINKS):
         proposal = low + (high - low) * rng.random(len(todo))
@@ -149,20 +161,3 @@ def density(points: Array, power: int) -> Array:
     np.exp(logits, out=logits)
     logits += 1
     return np.abs(points[-1]) ** power / np.multiply.reduce(logits, 0)
-
-
-def bracket(circle: Array, highest: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Two (M): the arc around angle 0 on which logits (2 h M) stay below ``highest`` (M)."""
-    cosine, sine = circle
-    with np.errstate(invalid="ignore", divide="ignore"):
-        size = np.abs(sine) + np.sqrt(cosine * cosine + sine * sine - highest * highest)
-        near = -(cosine + highest) / size
-        far = size / np.maximum(highest - cosine, 1e-30)
-    rising = sine <= 0
-    # Where a logit never gets so high the root is NaN, which fmax and fmin pass by.
-    above = np.fmax.reduce(np.where(rising, near, far))
-    below = np.fmin.reduce(np.where(rising, -far, -near))
-    high, low = 2 * np.arctan2(1, above), -2 * np.arctan2(1, -below)
-    closed = np.isnan(above)
-    high = np.where(closed, 2 * math.pi * rng.random(len(high)), high)
-    return np.where(closed, high - 2 * math.pi, low), high

@@ -9,7 +9,7 @@ PACKAGE = Path(torchrl_pref.__file__).parent
 
 LAYERS = [
     {"errors"},
-    {"responses"},
+    {"responses", "sampler_cpu"},
     {"acquisition", "sampler"},
     {"belief", "features", "gridworld"},
     {"queries", "humans", "objectives"},

@@ -153,7 +153,8 @@ def test_whole_protocol(monkeypatch: pytest.MonkeyPatch) -> None:
         Cell("query", "noisy", "balanced"),
         Cell("feed", "noisy"),
     }
-    assert "threshold 0.1 bits" in results[Cell("feed", "noisy")]
+    best = [name for name in results[Cell("feed", "noisy")] if name.startswith("threshold")]
+    assert best in (["threshold 0.1 bits"], ["threshold 9 bits"])
     assert results[Cell("query", "noisy")]["RL"].alignment.shape == (1, 1, heldout.HUMANS, 5)
     assert "two-step lookahead" in results[Cell("query", "noisy")]
 

@@ -45,21 +45,6 @@ def test_optimal_is_the_limit_of_boltzmann(generator: Generator) -> None:
         assert Boltzmann(tau)(returns * 1e3).isnan().sum() == 0
 
 
-@pytest.mark.parametrize("model", RESPONSE_MODELS, ids=str)
-def test_least_gap_bounds_the_gaps_of_likely_answers(
-    model: ResponseModel, generator: Generator
-) -> None:
-    gaps = torch.randn(1000, 2, generator=generator)
-    log_likelihood = model.log_likelihood(gaps)
-    possible = log_likelihood > -math.inf
-    bound = model.least_gap(log_likelihood[possible])
-    assert (gaps[possible].amin(-1) >= bound - 1e-5).all()
-    one = torch.linspace(-2, 2, 50)
-    if isinstance(model, Boltzmann):
-        tight = model.least_gap(model.log_likelihood(one.unsqueeze(-1)))
-        assert torch.allclose(tight, one, atol=1e-3)
-
-
 @pytest.mark.parametrize("model", [Boltzmann(1.0), Optimal()], ids=str)
 def test_simulated_humans_answer_as_often_as_they_should(
     model: ResponseModel, generator: Generator

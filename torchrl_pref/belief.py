@@ -25,8 +25,8 @@ from torchrl_pref.sampler import great_circle_step
 MAX_STAGES = 12
 """Twelve stages that keep a quarter each: what no sample agrees with then is a contradiction."""
 
-GROUP = 128
-"""Sessions that are moved at once: bounds memory and fits the cache."""
+MOVED = 2**18
+"""Samples that are moved at once: bounds memory whatever the number of sessions."""
 
 MIN_SHARE = 0.25
 """Kish effective share of the samples that a reweighting must keep; below it a stage is added."""
@@ -36,6 +36,20 @@ def uniform_sphere(shape: tuple[int, ...], generator: Generator) -> Tensor:
     """Draw weights uniformly on the unit sphere, (… D), on the generator's device."""
     normal = torch.randn(shape, generator=generator, device=generator.device)
     return F.normalize(normal, dim=-1)
+
+
+def orthonormal(n: int, shape: torch.Size, generator: Generator) -> Tensor:
+    """Random unit vectors (n … D) for a shape (… D), each at right angles to those before it.
+
+    They come in frames of D: moves along them, preconditioned, undo nothing of each other, so that
+    n = D of them do what half as many again do in independent directions.
+    """
+    vectors = torch.randn((n, *shape), generator=generator, device=generator.device)
+    for i in range(n):
+        for j in range(i - i % shape[-1], i):
+            vectors[i] -= (vectors[i] * vectors[j]).sum(-1, keepdim=True) * vectors[j]
+        vectors[i] = F.normalize(vectors[i], dim=-1)
+    return vectors
 
 
 def feature_gaps(queries: Tensor, answers: Tensor) -> Tensor:
@@ -80,7 +94,7 @@ class Belief:
         InputError: ``samples`` or ``moves`` is too small.
     """
 
-    def __init__(self, response_model: ResponseModel, samples: int = 100, moves: int = 6) -> None:
+    def __init__(self, response_model: ResponseModel, samples: int = 100, moves: int = 4) -> None:
         self.response_model = response_model
         self.n_samples = check_count("belief.samples", samples, 2)
         self.n_moves = check_count("belief.moves", moves, 1)
@@ -113,20 +127,13 @@ class Belief:
             newest: (S K-1 D), feature gaps of the answer to condition on.
             generator: the source of all randomness, on the device of the samples.
         """
-        if len(samples) <= GROUP:
-            return self._update(samples, ess, earlier, newest, generator)
-        # Sessions with as many answers go together, so that none pays for another's.
-        turns = torch.arange(1, earlier.shape[1] + 1, device=earlier.device)
-        answered = (earlier != 0).any(-1).any(-1) * turns
-        n_answers = answered.amax(1) if len(turns) else turns.new_zeros(len(samples))
-        order = n_answers.argsort(stable=True)
+        size = max(1, MOVED // self.n_samples)
         updates = []
-        for group in order.split(GROUP):
-            rows = int(n_answers[group[-1]])
-            session = samples[group], ess[group], earlier[group, :rows], newest[group]
+        for first in range(0, max(1, len(samples)), size):
+            some = slice(first, first + size)
+            session = samples[some], ess[some], earlier[some], newest[some]
             updates.append(self._update(*session, generator))
-        back = order.argsort()
-        return Update(*(torch.cat(parts)[back] for parts in zip(*updates, strict=True)))
+        return Update(*(torch.cat(field) for field in zip(*updates, strict=True)))
 
     def _update(
         self, samples: Tensor, ess: Tensor, earlier: Tensor, newest: Tensor, generator: Generator
@@ -204,10 +211,10 @@ class Belief:
         floor = 1e-6 * torch.eye(start.shape[-1], device=start.device)
         scale = torch.linalg.cholesky_ex(covariance_of(start) + floor).L
         moved = start
-        for _ in range(self.n_moves):
-            normal = torch.randn(start.shape, generator=generator, device=start.device)
-            pole = normal @ scale.mT
-            moved = great_circle_step(moved, pole, answers, slack, self.response_model, generator)
+        for directions in orthonormal(self.n_moves, start.shape, generator):
+            # As long as a Gaussian with this covariance is wide in the direction of the pole.
+            poles = directions @ scale.mT
+            moved = great_circle_step(moved, poles, answers, slack, self.response_model, generator)
         kept = _correlation(start, moved).clamp(min=0).square()
         return moved, (1 + kept * (inflation - 1)).clamp(max=self.n_samples)
 

@@ -34,6 +34,10 @@ class Prediction(NamedTuple):
 class ResponseModel(ABC):
     """The probability of an answer. It sees returns only, so it serves any task and any D."""
 
+    logistic: tuple[float, float] | None = None
+    """(tau, tolerance) of a model that ``sampler_cpu.py`` knows: Boltzmann, or Optimal with an
+    infinite tau. None for any other, whose samples are moved in tensors on the CPU too."""
+
     @abstractmethod
     def log_likelihood(self, gaps: Tensor) -> Tensor:
         """Log-probability that an option is chosen.
@@ -55,19 +59,6 @@ class ResponseModel(ABC):
             (…), natural logarithm.
         """
         return self.log_likelihood(gaps).sum(-1)
-
-    @abstractmethod
-    def least_gap(self, log_likelihood: Tensor) -> Tensor:
-        """The smallest gap to any other option at which an answer can be this likely.
-
-        A bound, by which the belief's sampler knows where not to look: it need not be attained.
-
-        Args:
-            log_likelihood: (…), at most 0.
-
-        Returns:
-            (…), in the units of the return.
-        """
 
     def __call__(self, returns: Tensor) -> Tensor:
         """Log-probability of each answer.
@@ -116,6 +107,7 @@ class Boltzmann(ResponseModel):
 
     def __init__(self, tau: float) -> None:
         self.tau = check_positive("tau", tau)
+        self.logistic = self.tau, 0.0
 
     def log_likelihood(self, gaps: Tensor) -> Tensor:
         """See :meth:`ResponseModel.log_likelihood`."""
@@ -130,12 +122,6 @@ class Boltzmann(ResponseModel):
         # log σ(z) = min(z, 0) + log σ(|z|)
         logit = self.tau * gaps.squeeze(-1)
         return logit.clamp(max=0).sum(-1) + sum_of_logs(logit.abs().sigmoid_())
-
-    def least_gap(self, log_likelihood: Tensor) -> Tensor:
-        """See :meth:`ResponseModel.least_gap`."""
-        # No option is chosen more often than it beats any one other, whose log is log σ(τ g).
-        surprise = -log_likelihood
-        return -(surprise + torch.log(-torch.expm1(-surprise))) / self.tau
 
     def __call__(self, returns: Tensor) -> Tensor:
         """See :meth:`ResponseModel.__call__`."""
@@ -171,16 +157,13 @@ class Optimal(ResponseModel):
 
     def __init__(self, tolerance: float = 1e-6) -> None:
         self.tolerance = tolerance
+        self.logistic = math.inf, tolerance
 
     def log_likelihood(self, gaps: Tensor) -> Tensor:
         """See :meth:`ResponseModel.log_likelihood`."""
         ties = 1 + (gaps.abs() <= self.tolerance).sum(-1)
         beaten = (gaps < -self.tolerance).any(-1)
         return torch.where(beaten, -math.inf, -ties.to(gaps.dtype).log())
-
-    def least_gap(self, log_likelihood: Tensor) -> Tensor:
-        """See :meth:`ResponseModel.least_gap`."""
-        return torch.full_like(log_likelihood, -self.tolerance)
 
     def predict(self, leads: Tensor) -> Prediction:
         """See :meth:`ResponseModel.predict`."""

@@ -21,7 +21,6 @@ import torch
 from torch import Generator, Tensor
 
 from benchmarks import common
-from torchrl_pref import sampler_cpu
 from torchrl_pref.acquisition import information_gain, predict_answers, score_queries
 from torchrl_pref.belief import (
     Belief,
@@ -32,6 +31,7 @@ from torchrl_pref.belief import (
 )
 from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel
 from torchrl_pref.sampler import ARC, MAX_SHRINKS
+from torchrl_pref.sampler_cpu import compiled_step
 
 SESSIONS = 100
 
@@ -137,7 +137,7 @@ def _moving(model: Boltzmann | Optimal, n_answers: int, repeats: int) -> common.
 
     def step(shrinks: int = MAX_SHRINKS) -> Tensor:
         given = samples, poles, gaps, slack, uniform[..., : 2 + shrinks]
-        return sampler_cpu.great_circle_step(*given, ARC, *model.logistic)
+        return compiled_step(*given, ARC, *model.logistic)
 
     # A sample that has not moved after so many shrinks needs one more evaluation.
     unmoved = sum((step(n) - samples).norm(dim=-1) < 1e-6 for n in range(MAX_SHRINKS))

@@ -5,7 +5,6 @@ import torch
 from conftest import RESPONSE_MODELS
 from torch import Generator, Tensor
 
-from torchrl_pref import sampler_cpu
 from torchrl_pref.belief import (
     Belief,
     feature_gaps,
@@ -16,6 +15,7 @@ from torchrl_pref.belief import (
 )
 from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel
 from torchrl_pref.sampler import ARC, MAX_SHRINKS, tensor_step
+from torchrl_pref.sampler_cpu import compiled_step
 
 
 class Unknown(Boltzmann):
@@ -209,7 +209,7 @@ def test_compiled_step_moves_samples_where_the_tensor_step_does(
     for slack in (torch.zeros(sessions), torch.rand(sessions, generator=generator)):
         given = samples, poles, gaps, slack, uniform
         assert model.logistic is not None
-        compiled = sampler_cpu.great_circle_step(*given, ARC, *model.logistic)
+        compiled = compiled_step(*given, ARC, *model.logistic)
         close = (compiled - tensor_step(*given, model)).norm(dim=-1) < 1e-3
         # A proposal at the very edge of its slice may be judged differently.
         assert close.float().mean() > 0.995

@@ -19,8 +19,8 @@ import torch
 from torch import Generator, Tensor
 from torch.nn import functional as F
 
-from torchrl_pref import sampler_cpu
 from torchrl_pref.responses import ResponseModel
+from torchrl_pref.sampler_cpu import compiled_step
 
 ARC = 16.0
 """Length of the arc that is searched, in standard deviations of the posterior along it. A short
@@ -60,7 +60,7 @@ def great_circle_step(
     uniform = torch.rand(size, generator=generator, device=samples.device)
     given = samples, poles, answers, slack, uniform
     if samples.is_cpu and response_model.logistic is not None:
-        return sampler_cpu.great_circle_step(*given, ARC, *response_model.logistic)
+        return compiled_step(*given, ARC, *response_model.logistic)
     return tensor_step(*given, response_model)
 
 

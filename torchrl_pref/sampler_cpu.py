@@ -25,7 +25,7 @@ Array = np.ndarray[Any, np.dtype[Any]]
 compiled = njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
 
 
-def great_circle_step(
+def compiled_step(
     samples: Tensor,
     poles: Tensor,
     answers: Tensor,
@@ -35,7 +35,7 @@ def great_circle_step(
     tau: float,
     tolerance: float,
 ) -> Tensor:
-    """See ``sampler.great_circle_step``; for response models that are ``logistic``.
+    """``sampler.great_circle_step`` with its uniforms given, for models that are ``logistic``.
 
     Args:
         samples, poles: (S M D).

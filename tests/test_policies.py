@@ -73,16 +73,32 @@ def test_scorer_starts_as_the_greedy_strategy_of_its_objective(
     assert torch.allclose(forecast[rows, chosen], forecast.amax(1), atol=1e-5)
 
 
-@pytest.mark.parametrize("objective", ["alignment", "information_gain"])
-def test_offer_scorer_starts_as_the_quantile_rule(objective: str, pool: QueryPool) -> None:
-    env = make(FeedEnv, pool, batch=50, objective=objective, skip="free")
-    acquisition = expected_alignment if objective == "alignment" else information_gain
-    rule = QuantileAsk(env, acquisition)
+@pytest.mark.parametrize("model", RESPONSE_MODELS, ids=str)
+def test_offer_scorer_starts_as_the_quantile_rule(model: ResponseModel, pool: QueryPool) -> None:
+    env = make(FeedEnv, pool, model, batch=50, skip="free")
+    rule = QuantileAsk(env, information_gain, expected_alignment)
     data = env.rollout(12, rule, break_when_any_done=False)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         learned = scorer_policy(env).strategy(data.clone().reshape(-1))["action"]
     assert (learned == data["action"].reshape(-1)).float().mean() > 0.99
     assert 0.05 < data["action"].float().mean() < 0.95
+
+
+def test_patience_asks_early_and_waits_late(pool: QueryPool) -> None:
+    env = make(FeedEnv, pool, batch=200, skip="free")
+    policy = scorer_policy(env)
+    session = session_of(env)
+    before = policy.strategy(session.clone())["logits"]
+    with torch.no_grad():
+        for name, weight in policy.weights.named_parameters():
+            if name.endswith("patience"):
+                weight.fill_(0.05)
+    after = policy.strategy(session.clone())["logits"]
+    assert (after[:, 1] > before[:, 1]).all()
+    # The last ask is given no more offers than the rule gives it.
+    session["n_asked"].fill_(env.budget - 1)
+    last = policy.strategy(session)
+    assert torch.allclose(last["later"], torch.zeros(()), atol=1e-6)
 
 
 @pytest.mark.parametrize("kind", ENVS)

@@ -128,6 +128,11 @@ def score_queries(
     return scores
 
 
+def together(*functions: Acquisition) -> Acquisition:
+    """Acquisition functions as one of several values (…), so that answers are predicted once."""
+    return lambda predicted, samples: torch.stack([f(predicted, samples) for f in functions], -1)
+
+
 def rank_offer(
     samples: Tensor,
     offer: Tensor,

@@ -24,7 +24,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Generator, Tensor, nn
 from tqdm import tqdm
 
-from torchrl_pref.acquisition import expected_alignment, volume_removal
+from torchrl_pref.acquisition import expected_alignment, information_gain, volume_removal
 from torchrl_pref.checkpoint import Checkpoint
 from torchrl_pref.comparison import FIRST_EVALUATION_SEED
 from torchrl_pref.envs import FeedEnv, QueryEnv
@@ -298,6 +298,7 @@ def _baselines(
             f"threshold {job.thresholds[0]:g} bits": ThresholdAsk(env, job.thresholds[0]),
             "quantile of information": QuantileAsk(env),
             "quantile of alignment": QuantileAsk(env, expected_alignment),
+            "quantile of both": QuantileAsk(env, information_gain, expected_alignment),
         }
     strategies: dict[str, TensorDictModuleBase] = {
         "random": RandomQuery(seed + 1),

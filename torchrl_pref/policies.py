@@ -61,10 +61,10 @@ def scorer_policy(env: QueryEnv | FeedEnv, start: str | None = None) -> Policy:
 
     Args:
         env: gives the response model of the belief, the objective and the kind of decision.
-        start: the objective whose greedy strategy it starts from; by default the environment's own.
+        start: the objective whose greedy strategy it starts from in the query setup; by default the
+            environment's own. In the feed it starts from the quantile rule.
     """
     device = torch.device(env.device)
-    greedy = greedy_feature(env.objective if start is None else start)
     n_shares = env.observation_spec["remaining"].shape[-1]
     if isinstance(env, QueryEnv):
         features = TensorDictModule(
@@ -72,14 +72,15 @@ def scorer_policy(env: QueryEnv | FeedEnv, start: str | None = None) -> Policy:
             in_keys=["samples", "queries"],
             out_keys=["candidate_features"],
         )
+        greedy = greedy_feature(env.objective if start is None else start)
         network: nn.Module = QueryScorer(greedy, n_shares, device)
     else:
         features = TensorDictModule(
             OfferFeatures(env),
             in_keys=["samples", "offer", "n_asked", "n_offered"],
-            out_keys=["offer_features", "ranks", "share"],
+            out_keys=["offer_features", "ranks", "share", "later"],
         )
-        network = OfferScorer(greedy, n_shares, device)
+        network = OfferScorer(n_shares, device)
     logits = TensorDictModule(
         network, in_keys=[*features.out_keys, "belief_features"], out_keys=["logits"]
     )

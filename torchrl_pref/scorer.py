@@ -13,11 +13,11 @@ from torch import Tensor, nn
 from torchrl.modules import MLP
 
 from torchrl_pref.acquisition import (
-    Acquisition,
     expected_alignment,
     information_gain,
     rank_offer,
     score_queries,
+    together,
     volume_removal,
 )
 from torchrl_pref.belief import covariance_of
@@ -35,6 +35,9 @@ N_BELIEF = 4
 
 QUERY_SCALE, FEED_SCALE = 8.0, 30.0
 """Logits per standard deviation of the greedy score, and per unit of rank, before training."""
+
+PATIENCE_SCALE = 20.0
+"""Patience per unit of its parameter: it is one number, and may move further than a weight."""
 
 
 class CandidateFeatures(nn.Module):
@@ -59,7 +62,7 @@ class CandidateFeatures(nn.Module):
             samples,
             queries,
             self.response_model,
-            _together(information_gain, expected_alignment, volume_removal),
+            together(information_gain, expected_alignment, volume_removal),
         ).unbind(-1)
         centred = queries - queries.mean(-2, keepdim=True)
         covariance = covariance_of(samples)
@@ -71,11 +74,6 @@ class CandidateFeatures(nn.Module):
             [gain, alignment - now, removal, variance.clamp(min=0).sqrt(), variance, apart, length],
             -1,
         )
-
-
-def _together(*functions: Acquisition) -> Acquisition:
-    """Acquisition functions as one of several values, so that answers are predicted once."""
-    return lambda predicted, samples: torch.stack([f(predicted, samples) for f in functions], -1)
 
 
 def greedy_feature(objective: str) -> int:
@@ -127,21 +125,28 @@ class QueryScorer(nn.Module):
 class OfferScorer(nn.Module):
     """The logits of skip and ask for one offer, started at the budget-aware quantile rule.
 
-    That rule asks if the offer's forecast ranks among the best share of a reference sample of the
-    pool, the share being asks left over offers left. The correction is zero at the start.
+    That rule asks if the offer ranks among the best share of a reference sample of the pool, the
+    share being asks left over offers left. Here the rank is the mean of those in information and in
+    expected alignment, and each ask is given offers in proportion to its number to the power of the
+    *patience*, which is learned: an early question is easily good enough, a late one worth waiting
+    for. The patience and a correction of the logits are zero at the start.
     """
 
-    def __init__(self, greedy: int, n_remaining: int, device: torch.device) -> None:
+    def __init__(self, n_remaining: int, device: torch.device) -> None:
         super().__init__()
-        self.greedy = greedy
         self.log_scale = nn.Parameter(torch.tensor(math.log(FEED_SCALE), device=device))
+        self.patience = nn.Parameter(torch.zeros((), device=device))
         self.network = _zero_headed_mlp(N_CANDIDATE + 2 + 1 + N_BELIEF + n_remaining, device)
 
-    def forward(self, offer: Tensor, ranks: Tensor, share: Tensor, belief: Tensor) -> Tensor:
-        """From offer features (B F), ranks of both gains (B 2), share (B 1) and belief features
-        (B G) to logits (B 2)."""
+    def forward(
+        self, offer: Tensor, ranks: Tensor, share: Tensor, later: Tensor, belief: Tensor
+    ) -> Tensor:
+        """From offer features (B F), ranks of both gains (B 2), the share of the best that is asked
+        (B 1), how much later the asks to come are (B 1) and belief features (B G) to logits (B 2).
+        """
+        eager = (share * (PATIENCE_SCALE * self.patience * later).exp()).clamp(max=1)
         # Half a rank breaks ties in favour of asking; at a share of 1 all that are left are asked.
-        margin = ranks[..., self.greedy, None] - (1 - share) + 0.5 / REFERENCE + (share >= 1)
+        margin = ranks.mean(-1, keepdim=True) - (1 - eager) + 0.5 / REFERENCE + (share >= 1)
         correction = self.network(torch.cat([offer, ranks, share, belief], -1))
         # The correction is in logits: in ranks, as small a step would be a large one.
         ask = self.log_scale.exp() * margin + correction
@@ -163,14 +168,16 @@ class OfferFeatures(nn.Module):
 
     def forward(
         self, samples: Tensor, offer: Tensor, n_asked: Tensor, n_offered: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """From samples (B M D), offer (B K D) and counts (B 1) to offer features (B F), ranks of
-        information and alignment gain (B 2), and asks left over offers left (B 1)."""
+        information and alignment gain (B 2), asks left over offers left (B 1), and the log of the
+        mean number of the asks left over that of the next (B 1)."""
         model = self.features.response_model
-        gains = _together(information_gain, expected_alignment)
+        gains = together(information_gain, expected_alignment)
         ranks = rank_offer(samples, offer, self.reference, model, gains)
         share = asks_over_offers(n_asked, n_offered, self.budget, self.n_offers)
-        return self.features(samples, offer.unsqueeze(1)).squeeze(1), ranks, share
+        later = (0.5 + 0.5 * self.budget / (n_asked + 1)).clamp(min=1).log()
+        return self.features(samples, offer.unsqueeze(1)).squeeze(1), ranks, share, later
 
 
 def _zero_headed_mlp(n_inputs: int, device: torch.device) -> MLP:

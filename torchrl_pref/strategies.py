@@ -21,6 +21,7 @@ from torchrl_pref.acquisition import (
     predict_answers,
     rank_offer,
     score_queries,
+    together,
 )
 from torchrl_pref.envs import FeedEnv
 from torchrl_pref.errors import check_count, check_share
@@ -185,23 +186,25 @@ class QuantileAsk(TensorDictModuleBase):
 
     Args:
         env: gives the response model, the pool and the budgets.
-        acquisition: the value of an offer; information gain by default.
+        acquisitions: the value of an offer, information gain by default; of several functions, the
+            mean of the ranks counts.
     """
 
     in_keys = ["samples", "offer", "n_asked", "n_offered"]
     out_keys = ["action"]
 
-    def __init__(self, env: FeedEnv, acquisition: Acquisition = information_gain) -> None:
+    def __init__(self, env: FeedEnv, *acquisitions: Acquisition) -> None:
         super().__init__()
-        self.response_model, self.acquisition = env.belief.response_model, acquisition
+        self.response_model = env.belief.response_model
+        self.acquisition = together(*(acquisitions or (information_gain,)))
         self.budget, self.n_offers, self.reference = env.budget, env.n_offers, reference_of(env)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` (B)."""
         samples, offer, n_asked, n_offered = (tensordict[key] for key in self.in_keys)
-        rank = rank_offer(samples, offer, self.reference, self.response_model, self.acquisition)
+        ranks = rank_offer(samples, offer, self.reference, self.response_model, self.acquisition)
         share = asks_over_offers(n_asked, n_offered, self.budget, self.n_offers)
-        return tensordict.set("action", (rank >= 1 - share.squeeze(-1)).long())
+        return tensordict.set("action", (ranks.mean(-1) >= 1 - share.squeeze(-1)).long())
 
 
 def reference_of(env: FeedEnv) -> Tensor:

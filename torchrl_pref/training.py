@@ -49,7 +49,7 @@ class A2CSettings:
         steps: T, steps of each session between two updates.
         optimizer: ``adam`` or ``rmsprop``.
         learning_rate: of the optimizer.
-        gamma: discount of the reward.
+        gamma: discount of the reward for each step; where skips are free, for each question.
         lmbda: of generalised advantage estimation; 1 is the plain advantage.
         entropy: coefficient of the entropy bonus.
         critic: coefficient of the critic's squared error.
@@ -187,6 +187,9 @@ class Trainer:
 
     def update(self, batch: TensorDictBase) -> None:
         """One A2C step on a batch (B T) of transitions."""
+        if getattr(self.env, "skip", None) == "free":
+            # A free skip takes none of the human's time: gamma discounts by the question.
+            batch["steps_to_next_obs"] = batch["next", "n_asked"] - batch["n_asked"]
         with torch.no_grad():
             self.advantage(batch)
         losses = self.loss(batch.reshape(-1))

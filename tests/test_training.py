@@ -126,6 +126,22 @@ def test_a2c_learns_what_the_feed_rewards(tmp_path: Path) -> None:
     assert sum(trainer.progress.history["train/reward"][-5:]) > 0
 
 
+@pytest.mark.parametrize("skip", ["free", "regret"])
+def test_gamma_counts_questions_where_skips_are_free(skip: str) -> None:
+    trainer, _ = trainer_of({**settings_of(gamma=0.5, lmbda=0.0, steps=20), "skip": skip})
+    batch = next(iter(trainer.collector))
+    critic = trainer.policy.critic
+    with torch.no_grad():
+        later = critic(batch["next"].clone())["state_value"]
+    trainer.update(batch)
+    asked = batch["action"].unsqueeze(-1) == 1
+    assert asked.any()
+    assert not asked.all()
+    discount = torch.where(asked | (skip == "regret"), 0.5, 1.0)
+    target = batch["next", "reward"] + discount * later * ~batch["next", "terminated"]
+    assert torch.allclose(batch["value_target"], target, atol=1e-5)
+
+
 def test_warm_up_spares_the_actor_and_the_average_follows() -> None:
     trainer, _ = trainer_of(settings_of(warm_up=2, average=0.9, learning_rate=0.01))
     weights = trainer.policy.weights

@@ -36,7 +36,7 @@ N_BELIEF = 4
 QUERY_SCALE, FEED_SCALE = 8.0, 30.0
 """Logits per standard deviation of the greedy score, and per unit of rank, before training."""
 
-PATIENCE_SCALE = 20.0
+PATIENCE_SCALE = 30.0
 """Patience per unit of its parameter: it is one number, and may move further than a weight."""
 
 

@@ -139,7 +139,7 @@ def test_gamma_counts_questions_where_skips_are_free(skip: str) -> None:
     assert not asked.all()
     discount = torch.where(asked | (skip == "regret"), 0.5, 1.0)
     target = batch["next", "reward"] + discount * later * ~batch["next", "terminated"]
-    assert torch.allclose(batch["value_target"], target, atol=1e-5)
+    assert torch.allclose(batch["value_target"], target, atol=1e-3)
 
 
 def test_warm_up_spares_the_actor_and_the_average_follows() -> None:

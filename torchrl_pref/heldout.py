@@ -58,6 +58,9 @@ FINE_SAMPLES, FINE_HUMANS = 4000, 5
 THRESHOLDS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5)
 """Bits; the best on the training pool is the fixed threshold of the feed."""
 
+FIT_HUMANS = 400
+"""Thresholds differ little: 100 humans would not tell the best from the next."""
+
 
 class Cell(NamedTuple):
     """One kind of task: ``query`` or ``feed``, the human's tau, and the feature set."""
@@ -318,7 +321,7 @@ def _fit_threshold(job: Job) -> Tensor:
     def make_env(sessions: int) -> FeedEnv:
         return make_feed_env(job.settings, task, task.train, sessions, 0)
 
-    env = make_env(HUMANS)
+    env = make_env(FIT_HUMANS)
     rules = {f"{bits:g}": ThresholdAsk(env, bits) for bits in job.thresholds}
     results = run_side_by_side(make_env, draw_humans(env), rules)
     return torch.stack([result.alignment[:, -1].mean() for result in results.values()])

@@ -25,8 +25,9 @@ COLORS = {
     "ask all": "#8f8f8f",
     "quantile of information": "#1f1f1f",
     "quantile of alignment": "#d55e00",
+    "threshold": "#cc79a7",
 }
-"""Strategies that are drawn; the others are in the tables only."""
+"""Strategies that are drawn, by name or its first word; the others are in the tables only."""
 
 
 def curve(outcome: Outcome) -> Tensor:
@@ -107,7 +108,7 @@ def figure(results: Results, path: Path) -> None:
     for (above, below), cell in zip(axes.T, cells, strict=True):
         outcomes = results[cell]
         for name, outcome in outcomes.items():
-            if name not in COLORS:
+            if _color(name) is None:
                 continue
             _draw(above, name, curve(outcome))
             if name not in ("RL", "random", "ask all"):
@@ -116,12 +117,11 @@ def figure(results: Results, path: Path) -> None:
         above.legend(frameon=False, loc="lower right", fontsize="small")
         below.axhline(0, color="#555555", lw=0.8)
         below.set(xlabel="queries asked")
-        below.legend(frameon=False, fontsize="small", title="RL minus", title_fontsize="small")
         for axis in (above, below):
             axis.grid(alpha=0.25)
             axis.xaxis.get_major_locator().set_params(integer=True)
     axes[0, 0].set_ylabel("alignment")
-    axes[1, 0].set_ylabel("difference")
+    axes[1, 0].set_ylabel("RL minus the strategy\nof that color")
     save_figure(fig, path)
 
 
@@ -129,7 +129,12 @@ def _draw(axis: Axes, name: str, values: Tensor) -> None:
     """Mean and interval of curves (P S H+1)."""
     means = values.mean((0, 1))
     bounds = torch.tensor([two_way_interval(column) for column in values.unbind(-1)])
-    draw_band(axis, means, bounds, color=COLORS[name], label=name)
+    draw_band(axis, means, bounds, color=_color(name), label=name)
+
+
+def _color(name: str) -> str | None:
+    """Of a strategy that is drawn."""
+    return COLORS.get(name, COLORS.get(name.split()[0]))
 
 
 def _interval(values: Tensor) -> str:

@@ -22,7 +22,7 @@ from torch.nn import functional as F
 from torchrl_pref.responses import ResponseModel
 from torchrl_pref.sampler_cpu import compiled_step
 
-ARC = 16.0
+ARC = 32.0
 """Length of the arc that is searched, in standard deviations of the posterior along it. A short
 one slows the mixing, a long one costs a shrink for each doubling."""
 

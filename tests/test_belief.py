@@ -216,6 +216,15 @@ def test_compiled_step_moves_samples_where_the_tensor_step_does(
         assert ((compiled - samples).norm(dim=-1) > 1e-3).float().mean() > 0.9
 
 
+@pytest.mark.parametrize("model", RESPONSE_MODELS, ids=str)
+def test_tensor_step_stays_on_its_device(model: ResponseModel) -> None:
+    """``meta`` stands for a GPU: nothing is computed, but devices must not be mixed."""
+    shapes = (5, 30, 4), (5, 30, 4), (5, 7, 1, 4), (5,), (5, 30, 2 + MAX_SHRINKS)
+    moved = tensor_step(*(torch.empty(shape, device="meta") for shape in shapes), model)
+    assert moved.device.type == "meta"
+    assert moved.shape == shapes[0]
+
+
 @pytest.mark.parametrize("n", [3, 4, 7])
 def test_directions_come_in_orthonormal_frames(n: int, generator: Generator) -> None:
     vectors = orthonormal(n, torch.Size((5, 6, 3)), generator).movedim(0, -2)

@@ -14,6 +14,7 @@ from pathlib import Path
 
 sys.path[0] = str(Path(__file__).resolve().parents[1])  # this folder's select.py hides Python's
 
+import math
 import time
 from collections.abc import Callable
 
@@ -137,7 +138,8 @@ def _moving(model: Boltzmann | Optimal, n_answers: int, repeats: int) -> common.
 
     def step(shrinks: int = MAX_SHRINKS) -> Tensor:
         given = samples, poles, gaps, slack, uniform[..., : 2 + shrinks]
-        return compiled_step(*given, ARC, *model.logistic)
+        tau, tolerance = getattr(model, "tau", math.inf), getattr(model, "tolerance", 0.0)
+        return compiled_step(*given, ARC, tau, tolerance)
 
     # A sample that has not moved after so many shrinks needs one more evaluation.
     unmoved = sum((step(n) - samples).norm(dim=-1) < 1e-6 for n in range(MAX_SHRINKS))

@@ -21,10 +21,6 @@ from torchrl_pref.sampler_cpu import compiled_step
 class Unknown(Boltzmann):
     """A model that the compiled step does not know."""
 
-    def __init__(self, tau: float) -> None:
-        super().__init__(tau)
-        self.logistic = None
-
 
 def grid_of_sphere(n_features: int) -> tuple[Tensor, Tensor]:
     """Points (G D) and weights (G) of a quadrature of the circle or of the sphere, in float64."""
@@ -181,6 +177,21 @@ def test_soft_answers_are_never_left_out(generator: Generator) -> None:
     assert samples.isfinite().all()
 
 
+def test_narrow_posteriors_are_still_explored(generator: Generator) -> None:
+    """Twenty hard answers that halve the circle each time: an arc of a few millionths is left."""
+    sessions = 50
+    belief = Belief(Optimal(tolerance=0.0))
+    samples, ess = belief.prior(sessions, 2, generator), torch.full((sessions,), 100.0)
+    gaps = torch.zeros(sessions, 0, 1, 2)
+    for h in range(14):
+        mean = samples.mean(1)
+        normal = torch.stack([-mean[:, 1], mean[:, 0]], -1).unsqueeze(1)
+        samples, ess, used = belief.update(samples, ess, gaps, normal, generator)
+        assert used.all()
+        gaps = torch.cat([gaps, normal.unsqueeze(1)], 1)
+        assert ess.mean() > 40, h
+
+
 def test_identical_options_teach_nothing(belief: Belief, generator: Generator) -> None:
     queries = torch.ones(3, 2, 4)
     samples, ess = converse(belief, queries, torch.tensor([0, 1, 0]), 300, generator)
@@ -188,12 +199,13 @@ def test_identical_options_teach_nothing(belief: Belief, generator: Generator) -
     assert (ess > 90).all()
 
 
-@pytest.mark.parametrize("n_options", [2, 4])
+@pytest.mark.parametrize("spread", [0.2, 0.02])
+@pytest.mark.parametrize(("n_options", "n_features"), [(2, 4), (4, 4), (2, 2)])
 @pytest.mark.parametrize("model", [*RESPONSE_MODELS, Boltzmann(300.0)], ids=str)
 def test_compiled_step_moves_samples_where_the_tensor_step_does(
-    model: ResponseModel, n_options: int, generator: Generator
+    model: ResponseModel, n_options: int, n_features: int, spread: float, generator: Generator
 ) -> None:
-    sessions, n_features = 20, 4
+    sessions = 20
     belief = Belief(model)
     samples, ess = belief.prior(sessions, n_features, generator), torch.full((sessions,), 100.0)
     omega = uniform_sphere((sessions, n_features, 1), generator)
@@ -204,12 +216,12 @@ def test_compiled_step_moves_samples_where_the_tensor_step_does(
         newest = feature_gaps(queries, answers.squeeze(-1))
         samples, ess, _ = belief.update(samples, ess, gaps, newest, generator)
         gaps[:, h] = newest  # until then a row of zeros
-    poles = torch.randn(samples.shape, generator=generator) * 0.2
+    poles = torch.randn(samples.shape, generator=generator) * spread
     uniform = torch.rand((*samples.shape[:2], 2 + MAX_SHRINKS), generator=generator)
     for slack in (torch.zeros(sessions), torch.rand(sessions, generator=generator)):
         given = samples, poles, gaps, slack, uniform
-        assert model.logistic is not None
-        compiled = compiled_step(*given, ARC, *model.logistic)
+        tau, tolerance = getattr(model, "tau", math.inf), getattr(model, "tolerance", 0.0)
+        compiled = compiled_step(*given, ARC, tau, tolerance)
         close = (compiled - tensor_step(*given, model)).norm(dim=-1) < 1e-3
         # A proposal at the very edge of its slice may be judged differently.
         assert close.float().mean() > 0.995

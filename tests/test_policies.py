@@ -80,6 +80,7 @@ def test_offer_scorer_starts_as_the_quantile_rule(model: ResponseModel, pool: Qu
     data = env.rollout(12, rule, break_when_any_done=False)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         learned = scorer_policy(env).strategy(data.clone().reshape(-1))["action"]
+    # Scores of another batch differ by rounding, and so may a rank.
     assert (learned == data["action"].reshape(-1)).float().mean() > 0.99
     assert 0.05 < data["action"].float().mean() < 0.95
 
@@ -95,10 +96,14 @@ def test_patience_asks_early_and_waits_late(pool: QueryPool) -> None:
                 weight.fill_(0.05)
     after = policy.strategy(session.clone())["logits"]
     assert (after[:, 1] > before[:, 1]).all()
-    # The last ask is given no more offers than the rule gives it.
+    # The last ask gets no more of the offers than the rule gives it.
     session["n_asked"].fill_(env.budget - 1)
-    last = policy.strategy(session)
-    assert torch.allclose(last["later"], torch.zeros(()), atol=1e-6)
+    late = policy.strategy(session.clone())["logits"]
+    with torch.no_grad():
+        for name, weight in policy.weights.named_parameters():
+            if name.endswith("patience"):
+                weight.zero_()
+    assert torch.allclose(late, policy.strategy(session)["logits"], atol=1e-5)
 
 
 @pytest.mark.parametrize("kind", ENVS)

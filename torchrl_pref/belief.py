@@ -208,8 +208,10 @@ class Belief:
         start = samples.gather(1, chosen.unsqueeze(-1).expand_as(samples))
         # Circles are turned to where the samples spread. Each sample is 1/M of that spread:
         # adaptive, and exact only as M grows. The floor keeps every direction possible.
-        floor = 1e-6 * torch.eye(start.shape[-1], device=start.device)
-        scale = torch.linalg.cholesky_ex(covariance_of(start) + floor).L
+        covariance = covariance_of(start)
+        floor = 1e-6 * covariance.diagonal(dim1=-2, dim2=-1).amax(-1).clamp(min=1e-12)
+        covariance.diagonal(dim1=-2, dim2=-1).add_(floor.unsqueeze(-1))
+        scale = torch.linalg.cholesky_ex(covariance).L
         moved = start
         for directions in orthonormal(self.n_moves, start.shape, generator):
             # As long as a Gaussian with this covariance is wide in the direction of the pole.

@@ -209,12 +209,10 @@ def make_policy(settings: Settings, env: QueryEnv | FeedEnv) -> Policy:
         return attention_policy(env, chosen["tokens"])
     if name == "paper":
         return paper_policy(env)
-    if chosen["start"] is not None and isinstance(env, FeedEnv):
-        raise InputError(
-            f"policy.start={chosen['start']}: in the feed the scorer starts from the quantile rule "
-            "of both gains; leave policy.start out, or set setup=query"
-        )
-    return scorer_policy(env, chosen["start"] or settings["objective"])
+    start = chosen["start"]
+    if start is None and isinstance(env, QueryEnv):
+        start = settings["objective"]  # as trained, whatever the environment's own is
+    return scorer_policy(env, start)
 
 
 def make_checkpoint(settings: Settings, task: Task, trainer: Trainer) -> Checkpoint:

@@ -135,7 +135,7 @@ def run_protocol(
     torch.multiprocessing.set_sharing_strategy("file_system")
     context = get_context("spawn")
     with ProcessPoolExecutor(workers, context, _start_worker) as executor:
-        feeds = {job.cell: job for job in jobs if job.cell.setup == "feed"}
+        feeds = {job.cell: job for job in jobs if job.cell.setup == "feed" and job.pool == 0}
         fits = [replace(job, learned=(), thresholds=THRESHOLDS) for job in feeds.values()]
         alignments = executor.map(_fit_threshold, fits)
         best = {

@@ -27,7 +27,7 @@ COLORS = {
     "quantile of alignment": "#d55e00",
     "threshold": "#cc79a7",
 }
-"""Strategies that are drawn, by name or its first word; the others are in the tables only."""
+"""Strategies that are drawn, whatever the threshold; the others are in the tables only."""
 
 
 def curve(outcome: Outcome) -> Tensor:
@@ -134,7 +134,7 @@ def _draw(axis: Axes, name: str, values: Tensor) -> None:
 
 def _color(name: str) -> str | None:
     """Of a strategy that is drawn."""
-    return COLORS.get(name, COLORS.get(name.split()[0]))
+    return COLORS.get("threshold" if name.startswith("threshold") else name)
 
 
 def _interval(values: Tensor) -> str:

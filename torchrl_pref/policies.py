@@ -17,7 +17,7 @@ from torchrl.modules import MLP, MaskedCategorical, ProbabilisticActor, ValueOpe
 
 from torchrl_pref.attention import TOKENS, AttentionScorer, OfferAttention
 from torchrl_pref.envs import FeedEnv, QueryEnv
-from torchrl_pref.errors import check_choice
+from torchrl_pref.errors import InputError, check_choice
 from torchrl_pref.scorer import (
     N_BELIEF,
     BeliefFeatures,
@@ -63,6 +63,9 @@ def scorer_policy(env: QueryEnv | FeedEnv, start: str | None = None) -> Policy:
         env: gives the response model of the belief, the objective and the kind of decision.
         start: the objective whose greedy strategy it starts from in the query setup; by default the
             environment's own. In the feed it starts from the quantile rule.
+
+    Raises:
+        InputError: there is no such objective, or ``start`` is given for a feed.
     """
     device = torch.device(env.device)
     n_shares = env.observation_spec["remaining"].shape[-1]
@@ -75,6 +78,11 @@ def scorer_policy(env: QueryEnv | FeedEnv, start: str | None = None) -> Policy:
         greedy = greedy_feature(env.objective if start is None else start)
         network: nn.Module = QueryScorer(greedy, n_shares, device)
     else:
+        if start is not None:
+            raise InputError(
+                f"policy.start={start}: in the feed the scorer starts from the quantile rule; "
+                "leave policy.start out, or set setup=query"
+            )
         features = TensorDictModule(
             OfferFeatures(env),
             in_keys=["samples", "offer", "n_asked", "n_offered"],

@@ -34,10 +34,6 @@ class Prediction(NamedTuple):
 class ResponseModel(ABC):
     """The probability of an answer. It sees returns only, so it serves any task and any D."""
 
-    logistic: tuple[float, float] | None = None
-    """(tau, tolerance) of a model that ``sampler_cpu.py`` knows: Boltzmann, or Optimal with an
-    infinite tau. None for any other, whose samples are moved in tensors on the CPU too."""
-
     @abstractmethod
     def log_likelihood(self, gaps: Tensor) -> Tensor:
         """Log-probability that an option is chosen.
@@ -107,7 +103,6 @@ class Boltzmann(ResponseModel):
 
     def __init__(self, tau: float) -> None:
         self.tau = check_positive("tau", tau)
-        self.logistic = self.tau, 0.0
 
     def log_likelihood(self, gaps: Tensor) -> Tensor:
         """See :meth:`ResponseModel.log_likelihood`."""
@@ -157,7 +152,6 @@ class Optimal(ResponseModel):
 
     def __init__(self, tolerance: float = 1e-6) -> None:
         self.tolerance = tolerance
-        self.logistic = math.inf, tolerance
 
     def log_likelihood(self, gaps: Tensor) -> Tensor:
         """See :meth:`ResponseModel.log_likelihood`."""

@@ -7,8 +7,8 @@ Hasenpflug, Kodgirwar and Rudolf, *Geodesic slice sampling on the sphere*, 2023)
 size that must be right, and works for hard answers, whose likelihood is zero on one side.
 
 The step is here twice: in tensors, for any response model on any device, and in ``sampler_cpu.py``
-as a compiled loop, for the models of this package on the CPU. Given the same uniforms both move
-every sample to the same place.
+as a compiled loop, for the models of this package on the CPU. Given the same uniforms both move a
+sample to the same place, but for rounding at the very edge of a slice.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ import torch
 from torch import Generator, Tensor
 from torch.nn import functional as F
 
-from torchrl_pref.responses import ResponseModel
+from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel
 from torchrl_pref.sampler_cpu import compiled_step
 
 ARC = 32.0
 """Length of the arc that is searched, in standard deviations of the posterior along it. A short
 one slows the mixing, a long one costs a shrink for each doubling."""
 
-MAX_SHRINKS = 12
+MAX_SHRINKS = 16
 """Shrinks of an arc before a sample stays where it is. The same shrinks lead back from where it
 would have gone, so that giving up leaves the posterior invariant too."""
 
@@ -48,7 +48,7 @@ def great_circle_step(
     Args:
         samples: (S M D), unit vectors.
         poles: (S M D), as long as the posterior is wide in their direction, above zero.
-        answers: (S H K-1 D), feature gaps of the answers; zero rows are ignored.
+        answers: (S H K-1 D), feature gaps of at least one answer; zero rows are ignored.
         slack: (S), by how much the return gaps of the last answer are raised.
         response_model: the likelihood.
         generator: the source of randomness, on the device of the samples.
@@ -57,10 +57,13 @@ def great_circle_step(
         (S M D), unit vectors.
     """
     size = (*samples.shape[:2], 2 + MAX_SHRINKS)
-    uniform = torch.rand(size, generator=generator, device=samples.device)
+    uniform = torch.rand(size, generator=generator, dtype=samples.dtype, device=samples.device)
     given = samples, poles, answers, slack, uniform
-    if samples.is_cpu and response_model.logistic is not None:
-        return compiled_step(*given, ARC, *response_model.logistic)
+    # Not a subclass: it may have another likelihood.
+    if samples.is_cpu and type(response_model) is Boltzmann:
+        return compiled_step(*given, ARC, response_model.tau, 0.0)
+    if samples.is_cpu and type(response_model) is Optimal:
+        return compiled_step(*given, ARC, math.inf, response_model.tolerance)
     return tensor_step(*given, response_model)
 
 

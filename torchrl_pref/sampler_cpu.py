@@ -35,7 +35,7 @@ def compiled_step(
     tau: float,
     tolerance: float,
 ) -> Tensor:
-    """``sampler.great_circle_step`` with its uniforms given, for models that are ``logistic``.
+    """``sampler.great_circle_step`` with its uniforms given, for Boltzmann and optimal humans.
 
     Args:
         samples, poles: (S M D).
@@ -230,8 +230,8 @@ def _surprise(
 
 @compiled
 def _exp_minus(x: float) -> float:
-    """exp(-x) of x from 0 on, to within 2·10⁻⁷: as (exp(-x/1024))^1024, which, unlike the library's
-    exp, is computed for several x at once."""
+    """exp(-x) of x from 0 on, with an error of at most 2·10⁻⁷: as (exp(-x/1024))^1024, which is
+    computed for several x at once, and the library's exp is not."""
     x = min(x, 700.0) / 1024
     power = 1.0 - x + 0.5 * x * x
     for _ in range(10):

@@ -127,9 +127,9 @@ class OfferScorer(nn.Module):
 
     That rule asks if the offer ranks among the best share of a reference sample of the pool, the
     share being asks left over offers left. Here the rank is the mean of those in information and in
-    expected alignment, and each ask is given offers in proportion to its number to the power of the
-    *patience*, which is learned: an early question is easily good enough, a late one worth waiting
-    for. The patience and a correction of the logits are zero at the start.
+    expected alignment, and the share grows with the *patience*-th power of how much later the asks
+    to come are than the next one: an early question is easily good enough, a late one worth waiting
+    for. The patience is learned; it and a correction of the logits are zero at the start.
     """
 
     def __init__(self, n_remaining: int, device: torch.device) -> None:
@@ -145,8 +145,9 @@ class OfferScorer(nn.Module):
         (B 1), how much later the asks to come are (B 1) and belief features (B G) to logits (B 2).
         """
         eager = (share * (PATIENCE_SCALE * self.patience * later).exp()).clamp(max=1)
-        # Half a rank breaks ties in favour of asking; at a share of 1 all that are left are asked.
-        margin = ranks.mean(-1, keepdim=True) - (1 - eager) + 0.5 / REFERENCE + (share >= 1)
+        # Half a step of the mean rank breaks ties in favour of asking; at a share of 1 all that are
+        # left are asked.
+        margin = ranks.mean(-1, keepdim=True) - (1 - eager) + 0.25 / REFERENCE + (share >= 1)
         correction = self.network(torch.cat([offer, ranks, share, belief], -1))
         # The correction is in logits: in ranks, as small a step would be a large one.
         ask = self.log_scale.exp() * margin + correction

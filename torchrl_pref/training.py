@@ -50,7 +50,7 @@ class A2CSettings:
         optimizer: ``adam`` or ``rmsprop``.
         learning_rate: of the optimizer.
         gamma: discount of the reward for each step; where skips are free, for each question.
-        lmbda: of generalised advantage estimation; 1 is the plain advantage.
+        lmbda: of generalised advantage estimation, for each step; 1 is the plain advantage.
         entropy: coefficient of the entropy bonus.
         critic: coefficient of the critic's squared error.
         grad_norm: the gradient is clipped to this length.

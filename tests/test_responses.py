@@ -45,6 +45,12 @@ def test_optimal_is_the_limit_of_boltzmann(generator: Generator) -> None:
         assert Boltzmann(tau)(returns * 1e3).isnan().sum() == 0
 
 
+@pytest.mark.parametrize("parent", [Boltzmann, Optimal])
+def test_closed_forms_are_not_inherited(parent: type) -> None:
+    with pytest.raises(TypeError, match="derive from ResponseModel"):
+        type("Lapsing", (parent,), {})
+
+
 @pytest.mark.parametrize("model", [Boltzmann(1.0), Optimal()], ids=str)
 def test_simulated_humans_answer_as_often_as_they_should(
     model: ResponseModel, generator: Generator

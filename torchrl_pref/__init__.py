@@ -5,7 +5,7 @@ from torchrl_pref.envs import FeedEnv, QueryEnv
 from torchrl_pref.features import Normalizer
 from torchrl_pref.humans import SimulatedHuman
 from torchrl_pref.queries import QueryPool, gridworld_pool
-from torchrl_pref.responses import Boltzmann, Optimal, calibrate_tau
+from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel, calibrate_tau
 
 __all__ = [
     "Belief",
@@ -15,6 +15,7 @@ __all__ = [
     "Optimal",
     "QueryEnv",
     "QueryPool",
+    "ResponseModel",
     "SimulatedHuman",
     "calibrate_tau",
     "gridworld_pool",

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from typing import NamedTuple
+from typing import Any, NamedTuple, final
 
 import torch
 from torch import Tensor
@@ -88,6 +88,7 @@ class ResponseModel(ABC):
         return Prediction(probs, entropy)
 
 
+@final
 class Boltzmann(ResponseModel):
     r"""The paper's noisily rational human (section 3.2).
 
@@ -100,6 +101,9 @@ class Boltzmann(ResponseModel):
     Raises:
         InputError: ``tau`` is not a finite number above zero.
     """
+
+    def __init_subclass__(cls, **_: Any) -> None:
+        _refuse_subclass(cls, Boltzmann)
 
     def __init__(self, tau: float) -> None:
         self.tau = check_positive("tau", tau)
@@ -142,6 +146,7 @@ class Boltzmann(ResponseModel):
         return f"Boltzmann(tau={self.tau:g})"
 
 
+@final
 class Optimal(ResponseModel):
     """The paper's optimal user, the limit of ``Boltzmann`` as tau grows: argmax, ties uniform.
 
@@ -149,6 +154,9 @@ class Optimal(ResponseModel):
         tolerance: gaps this small count as ties. It absorbs the rounding of float32 returns, so a
             belief never excludes the very human who answered. In the units of the return.
     """
+
+    def __init_subclass__(cls, **_: Any) -> None:
+        _refuse_subclass(cls, Optimal)
 
     def __init__(self, tolerance: float = 1e-6) -> None:
         self.tolerance = tolerance
@@ -169,6 +177,18 @@ class Optimal(ResponseModel):
 
     def __repr__(self) -> str:
         return "Optimal()"
+
+
+def _refuse_subclass(cls: type, parent: type) -> None:
+    """Closed forms of its own likelihood make a model unfit to be derived from.
+
+    Raises:
+        TypeError: always.
+    """
+    raise TypeError(
+        f"{cls.__name__} derives from {parent.__name__}, whose closed forms it would inherit with "
+        "another likelihood; derive from ResponseModel and define log_likelihood"
+    )
 
 
 def sum_of_logs(probs: Tensor) -> Tensor:

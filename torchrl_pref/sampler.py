@@ -59,10 +59,9 @@ def great_circle_step(
     size = (*samples.shape[:2], 2 + MAX_SHRINKS)
     uniform = torch.rand(size, generator=generator, dtype=samples.dtype, device=samples.device)
     given = samples, poles, answers, slack, uniform
-    # Not a subclass: it may have another likelihood.
-    if samples.is_cpu and type(response_model) is Boltzmann:
+    if samples.is_cpu and isinstance(response_model, Boltzmann):
         return compiled_step(*given, ARC, response_model.tau, 0.0)
-    if samples.is_cpu and type(response_model) is Optimal:
+    if samples.is_cpu and isinstance(response_model, Optimal):
         return compiled_step(*given, ARC, math.inf, response_model.tolerance)
     return tensor_step(*given, response_model)
 

@@ -138,9 +138,10 @@ class Boltzmann(ResponseModel):
         logit = self.tau * leads.squeeze(-1)
         first = torch.sigmoid(logit)
         second = 1 - first
+        probs = torch.stack([first, second]).movedim(0, -1)
         unlikely, likely = torch.minimum(first, second), torch.maximum(first, second)
-        entropy = (logit.abs() * unlikely).mean(-1) - sum_of_logs(likely) / logit.shape[-1]
-        return Prediction(torch.stack([first, second]).movedim(0, -1), entropy)
+        entropy = logit.abs_().mul_(unlikely).mean(-1) - sum_of_logs(likely) / logit.shape[-1]
+        return Prediction(probs, entropy)
 
     def __repr__(self) -> str:
         return f"Boltzmann(tau={self.tau:g})"

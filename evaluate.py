@@ -23,9 +23,18 @@ from torchrl_pref.pretrained import SEEDS, pretrained_checkpoint
 from torchrl_pref.queries import QueryPool
 
 PROTOCOL_KEYS = (
-    *("checkpoint", "workers", "device", "threads", "hydra."),
-    *("setup.budget", "setup.offers", "belief.", "grid."),
-    *("pool.size", "pool.options", "pool.seed"),
+    "checkpoint",
+    "workers",
+    "device",
+    "threads",
+    "hydra.",
+    "setup.budget",
+    "setup.offers",
+    "belief.",
+    "grid.",
+    "pool.size",
+    "pool.options",
+    "pool.seed",
 )
 """What may be typed beside ``protocol``; the rest is the protocol's own."""
 

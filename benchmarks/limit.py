@@ -14,7 +14,6 @@ from pathlib import Path
 
 sys.path[0] = str(Path(__file__).resolve().parents[1])  # this folder's select.py hides Python's
 
-import math
 import time
 from collections.abc import Callable
 
@@ -31,7 +30,7 @@ from torchrl_pref.belief import (
     uniform_sphere,
 )
 from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel
-from torchrl_pref.sampler import ARC, MAX_SHRINKS
+from torchrl_pref.sampler import ARC, MAX_SHRINKS, compiled_constants
 from torchrl_pref.sampler_cpu import compiled_step
 
 SESSIONS = 100
@@ -116,7 +115,7 @@ def _compiled(
     return lambda: kernel(samples, queries), time.perf_counter() - start
 
 
-def _moving(model: Boltzmann | Optimal, n_answers: int, repeats: int) -> common.Row:
+def _moving(model: ResponseModel, n_answers: int, repeats: int) -> common.Row:
     """One Markov step of the belief after so many answers."""
     generator = Generator().manual_seed(0)
     pool = common.normalised_pool().features
@@ -136,10 +135,12 @@ def _moving(model: Boltzmann | Optimal, n_answers: int, repeats: int) -> common.
     slack = torch.zeros(SESSIONS)
     uniform = torch.rand((*samples.shape[:2], 2 + MAX_SHRINKS), generator=generator)
 
+    constants = compiled_constants(model)
+    assert constants is not None
+
     def step(shrinks: int = MAX_SHRINKS) -> Tensor:
         given = samples, poles, gaps, slack, uniform[..., : 2 + shrinks]
-        tau, tolerance = getattr(model, "tau", math.inf), getattr(model, "tolerance", 0.0)
-        return compiled_step(*given, ARC, tau, tolerance)
+        return compiled_step(*given, ARC, *constants)
 
     # A sample that has not moved after so many shrinks needs one more evaluation.
     unmoved = sum((step(n) - samples).norm(dim=-1) < 1e-6 for n in range(MAX_SHRINKS))

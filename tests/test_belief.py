@@ -14,7 +14,7 @@ from torchrl_pref.belief import (
     uniform_sphere,
 )
 from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel
-from torchrl_pref.sampler import ARC, MAX_SHRINKS, tensor_step
+from torchrl_pref.sampler import ARC, MAX_SHRINKS, compiled_constants, tensor_step
 from torchrl_pref.sampler_cpu import compiled_step
 
 
@@ -223,8 +223,9 @@ def test_compiled_step_moves_samples_where_the_tensor_step_does(
     uniform = torch.rand((*samples.shape[:2], 2 + MAX_SHRINKS), generator=generator)
     for slack in (torch.zeros(sessions), torch.rand(sessions, generator=generator)):
         given = samples, poles, gaps, slack, uniform
-        tau, tolerance = getattr(model, "tau", math.inf), getattr(model, "tolerance", 0.0)
-        compiled = compiled_step(*given, ARC, tau, tolerance)
+        constants = compiled_constants(model)
+        assert constants is not None
+        compiled = compiled_step(*given, ARC, *constants)
         close = (compiled - tensor_step(*given, model)).norm(dim=-1) < 1e-3
         # A proposal at the very edge of its slice may be judged differently.
         assert close.float().mean() > 0.995

@@ -59,11 +59,19 @@ def great_circle_step(
     size = (*samples.shape[:2], 2 + MAX_SHRINKS)
     uniform = torch.rand(size, generator=generator, dtype=samples.dtype, device=samples.device)
     given = samples, poles, answers, slack, uniform
-    if samples.is_cpu and isinstance(response_model, Boltzmann):
-        return compiled_step(*given, ARC, response_model.tau, 0.0)
-    if samples.is_cpu and isinstance(response_model, Optimal):
-        return compiled_step(*given, ARC, math.inf, response_model.tolerance)
+    constants = compiled_constants(response_model)
+    if samples.is_cpu and constants is not None:
+        return compiled_step(*given, ARC, *constants)
     return tensor_step(*given, response_model)
+
+
+def compiled_constants(response_model: ResponseModel) -> tuple[float, float] | None:
+    """What ``sampler_cpu.compiled_step`` knows a model by: tau and tolerance; None for others."""
+    if isinstance(response_model, Boltzmann):
+        return response_model.tau, 0.0
+    if isinstance(response_model, Optimal):
+        return math.inf, response_model.tolerance
+    return None
 
 
 def tensor_step(

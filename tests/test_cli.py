@@ -144,6 +144,13 @@ def test_paper_experiment(setup: str, tmp_path: Path) -> None:
     assert ("training pool" in output) == (setup == "query")
 
 
+def test_attention_experiment(tmp_path: Path) -> None:
+    run("train.py", "experiment=attention", *TINY, f"hydra.run.dir={tmp_path}")
+    settings = Checkpoint.load(tmp_path).settings
+    assert (settings["setup"]["name"], settings["policy"]["name"]) == ("query", "attention")
+    assert settings["training"]["gamma"] == 0
+
+
 def test_evaluate_compares_the_baselines(tmp_path: Path) -> None:
     output = run("evaluate.py", *TINY_TASK, f"hydra.run.dir={tmp_path}")
     for row in ("optimal user", "noisy user", "random", "greedy", "cosine of mean", "repeated"):

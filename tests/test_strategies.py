@@ -1,5 +1,6 @@
 import math
 
+import numpy as np
 import pytest
 import torch
 from conftest import RESPONSE_MODELS
@@ -102,6 +103,25 @@ def test_threshold_asks_above_it_and_at_the_end(pool: QueryPool) -> None:
         assert torch.equal(data["action"][:, step] == 1, asks)
 
 
+def test_rank_by_two_functions_is_by_their_mean_in_standard_deviations(pool: QueryPool) -> None:
+    env = make(FeedEnv, pool, batch=40, skip="free")
+    first, model = env.reset(), env.belief.response_model
+    both = (information_gain, expected_alignment)
+    ranks = rank_offer(first["samples"], first["offer"], pool.features, model, *both)
+    for samples, offer, rank in zip(first["samples"], first["offer"], ranks, strict=True):
+        queries = torch.cat([offer.unsqueeze(0), pool.features]).unsqueeze(0)
+        predicted = predict_answers(samples.unsqueeze(0), queries, model)
+        total = np.zeros(len(pool) + 1)
+        for function in both:
+            values = function(predicted, samples.unsqueeze(0))[0].double().numpy()
+            total += (values - values.mean()) / values.std()
+        assert rank.item() == pytest.approx((total[0] > total[1:] + 2e-3).mean(), abs=1e-6)
+    itself = rank_offer(
+        first["samples"], pool.features[:1].expand(40, -1, -1), pool.features[:1], model, *both
+    )
+    assert (itself == 0).all()
+
+
 @pytest.mark.parametrize("acquisition", [information_gain, expected_alignment])
 def test_quantile_rule_uses_up_its_asks_on_the_best(acquisition: object, pool: QueryPool) -> None:
     env = make(FeedEnv, pool, batch=40, skip="free")
@@ -114,6 +134,6 @@ def test_quantile_rule_uses_up_its_asks_on_the_best(acquisition: object, pool: Q
         env.belief.response_model,
         acquisition,  # type: ignore[arg-type]
     )
-    assert torch.equal(first["action"] == 1, rank >= 1 - 5 / 25)
+    assert torch.equal(first["action"] == 1, rank.squeeze(-1) >= 1 - 5 / 25)
     asked = data["next", "n_asked"].squeeze(-1).amax(1)
     assert (asked == 5).all()

@@ -133,26 +133,35 @@ def together(*functions: Acquisition) -> Acquisition:
     return lambda predicted, samples: torch.stack([f(predicted, samples) for f in functions], -1)
 
 
+def standardise(scores: Tensor) -> Tensor:
+    """Scores (B C V) less their mean, in their standard deviations, each over the C candidates."""
+    centred = scores - scores.mean(-2, keepdim=True)
+    return centred / centred.square().mean(-2, keepdim=True).sqrt().clamp(min=1e-6)
+
+
 def rank_offer(
     samples: Tensor,
     offer: Tensor,
     reference: Tensor,
     response_model: ResponseModel,
-    acquisition: Acquisition,
+    *acquisitions: Acquisition,
 ) -> Tensor:
     """The share of a reference set of queries that an offered query scores above.
+
+    Of several acquisition functions the mean counts, each in its standard deviations over the set.
 
     Args:
         samples: (B M D), the belief.
         offer: (B K D), the offered query.
         reference: (N K D), what may be offered.
         response_model: how the belief thinks the human answers.
-        acquisition: what makes the score; it may return several numbers, (B c …).
+        acquisitions: what makes the score, at least one.
 
     Returns:
-        (B …), from 0 to 1.
+        (B 1), from 0 to 1.
     """
     queries = torch.cat([offer.unsqueeze(1), reference.expand(len(offer), *reference.shape)], 1)
-    scores = score_queries(samples, queries, response_model, acquisition)
+    scores = score_queries(samples, queries, response_model, together(*acquisitions))
+    score = standardise(scores).mean(-1)
     # The margin keeps a query from outranking itself by rounding.
-    return (scores[:, :1] > scores[:, 1:] + 1e-6).float().mean(1)
+    return (score[:, :1] > score[:, 1:] + 1e-3).float().mean(1, keepdim=True)

@@ -17,6 +17,7 @@ from torchrl_pref.acquisition import (
     information_gain,
     rank_offer,
     score_queries,
+    standardise,
     together,
     volume_removal,
 )
@@ -36,7 +37,7 @@ N_BELIEF = 4
 QUERY_SCALE, FEED_SCALE = 8.0, 30.0
 """Logits per standard deviation of the greedy score, and per unit of rank, before training."""
 
-PATIENCE_SCALE = 30.0
+PATIENCE_SCALE = 20.0
 """Patience per unit of its parameter: it is one number, and may move further than a weight."""
 
 
@@ -115,8 +116,7 @@ class QueryScorer(nn.Module):
 
     def forward(self, candidates: Tensor, belief: Tensor) -> Tensor:
         """From candidate features (B C F) and belief features (B G) to logits (B C)."""
-        centred = candidates - candidates.mean(-2, keepdim=True)
-        standard = centred / centred.square().mean(-2, keepdim=True).sqrt().clamp(min=1e-6)
+        standard = standardise(candidates)
         belief = belief.unsqueeze(-2).expand(*candidates.shape[:-1], -1)
         correction = self.network(torch.cat([candidates, standard, belief], -1)).squeeze(-1)
         return self.log_scale.exp() * (standard[..., self.greedy] + correction)
@@ -126,36 +126,34 @@ class OfferScorer(nn.Module):
     """The logits of skip and ask for one offer, started at the budget-aware quantile rule.
 
     That rule asks if the offer ranks among the best share of a reference sample of the pool, the
-    share being asks left over offers left. Here the rank is the mean of those in information and in
-    expected alignment, and the share grows with the *patience*-th power of how much later the asks
-    to come are than the next one: an early question is easily good enough, a late one worth waiting
-    for. The patience is learned; it and a correction of the logits are zero at the start.
+    share being asks left over offers left. Here the rank is by information and expected alignment
+    together, and the share grows with the *patience*-th power of how much later the asks to come
+    are than the next one: an early question is easily good enough, a late one worth waiting for.
+    The patience is learned; it and a correction of the logits are zero at the start.
     """
 
     def __init__(self, n_remaining: int, device: torch.device) -> None:
         super().__init__()
         self.log_scale = nn.Parameter(torch.tensor(math.log(FEED_SCALE), device=device))
         self.patience = nn.Parameter(torch.zeros((), device=device))
-        self.network = _zero_headed_mlp(N_CANDIDATE + 2 + 1 + N_BELIEF + n_remaining, device)
+        self.network = _zero_headed_mlp(N_CANDIDATE + 1 + 1 + N_BELIEF + n_remaining, device)
 
     def forward(
-        self, offer: Tensor, ranks: Tensor, share: Tensor, later: Tensor, belief: Tensor
+        self, offer: Tensor, rank: Tensor, share: Tensor, later: Tensor, belief: Tensor
     ) -> Tensor:
-        """From offer features (B F), ranks of both gains (B 2), the share of the best that is asked
-        (B 1), how much later the asks to come are (B 1) and belief features (B G) to logits (B 2).
-        """
+        """From offer features (B F), its rank (B 1), the share of the best that is asked (B 1), how
+        much later the asks to come are (B 1) and belief features (B G) to logits (B 2)."""
         eager = (share * (PATIENCE_SCALE * self.patience * later).exp()).clamp(max=1)
-        # Half a step of the mean rank breaks ties in favour of asking; at a share of 1 all that are
-        # left are asked.
-        margin = ranks.mean(-1, keepdim=True) - (1 - eager) + 0.25 / REFERENCE + (share >= 1)
-        correction = self.network(torch.cat([offer, ranks, share, belief], -1))
+        # Half a rank breaks ties in favour of asking; at a share of 1 all that are left are asked.
+        margin = rank - (1 - eager) + 0.5 / REFERENCE + (share >= 1)
+        correction = self.network(torch.cat([offer, rank, share, belief], -1))
         # The correction is in logits: in ranks, as small a step would be a large one.
         ask = self.log_scale.exp() * margin + correction
         return torch.cat([torch.zeros_like(ask), ask], -1)
 
 
 class OfferFeatures(nn.Module):
-    """The features of the one offered query, and its ranks among a reference sample of the pool.
+    """The features of the one offered query, and its rank among a reference sample of the pool.
 
     Args:
         env: gives the response model, the pool and the budgets.
@@ -170,15 +168,14 @@ class OfferFeatures(nn.Module):
     def forward(
         self, samples: Tensor, offer: Tensor, n_asked: Tensor, n_offered: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """From samples (B M D), offer (B K D) and counts (B 1) to offer features (B F), ranks of
-        information and alignment gain (B 2), asks left over offers left (B 1), and the log of the
+        """From samples (B M D), offer (B K D) and counts (B 1) to offer features (B F), the rank in
+        information and alignment gain (B 1), asks left over offers left (B 1), and the log of the
         mean number of the asks left over that of the next (B 1)."""
-        model = self.features.response_model
-        gains = together(information_gain, expected_alignment)
-        ranks = rank_offer(samples, offer, self.reference, model, gains)
+        gains = (information_gain, expected_alignment)
+        rank = rank_offer(samples, offer, self.reference, self.features.response_model, *gains)
         share = asks_over_offers(n_asked, n_offered, self.budget, self.n_offers)
         later = (0.5 + 0.5 * self.budget / (n_asked + 1)).clamp(min=1).log()
-        return self.features(samples, offer.unsqueeze(1)).squeeze(1), ranks, share, later
+        return self.features(samples, offer.unsqueeze(1)).squeeze(1), rank, share, later
 
 
 def _zero_headed_mlp(n_inputs: int, device: torch.device) -> MLP:

@@ -21,13 +21,12 @@ from torchrl_pref.acquisition import (
     predict_answers,
     rank_offer,
     score_queries,
-    together,
 )
 from torchrl_pref.envs import FeedEnv
 from torchrl_pref.errors import check_count, check_share
 from torchrl_pref.responses import ResponseModel
 
-REFERENCE = 100
+REFERENCE = 200
 """Queries of the pool among which a feed strategy ranks an offer."""
 
 
@@ -186,8 +185,8 @@ class QuantileAsk(TensorDictModuleBase):
 
     Args:
         env: gives the response model, the pool and the budgets.
-        acquisitions: the value of an offer, information gain by default; of several functions, the
-            mean of the ranks counts.
+        acquisitions: the value of an offer, information gain by default; of several functions the
+            mean counts, each in standard deviations.
     """
 
     in_keys = ["samples", "offer", "n_asked", "n_offered"]
@@ -196,15 +195,15 @@ class QuantileAsk(TensorDictModuleBase):
     def __init__(self, env: FeedEnv, *acquisitions: Acquisition) -> None:
         super().__init__()
         self.response_model = env.belief.response_model
-        self.acquisition = together(*(acquisitions or (information_gain,)))
+        self.acquisitions = acquisitions or (information_gain,)
         self.budget, self.n_offers, self.reference = env.budget, env.n_offers, reference_of(env)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` (B)."""
         samples, offer, n_asked, n_offered = (tensordict[key] for key in self.in_keys)
-        ranks = rank_offer(samples, offer, self.reference, self.response_model, self.acquisition)
+        rank = rank_offer(samples, offer, self.reference, self.response_model, *self.acquisitions)
         share = asks_over_offers(n_asked, n_offered, self.budget, self.n_offers)
-        return tensordict.set("action", (ranks.mean(-1) >= 1 - share.squeeze(-1)).long())
+        return tensordict.set("action", (rank >= 1 - share).squeeze(-1).long())
 
 
 def reference_of(env: FeedEnv) -> Tensor:

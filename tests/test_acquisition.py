@@ -11,7 +11,7 @@ from torch import Generator, Tensor
 from torchrl_pref import acquisition
 from torchrl_pref.acquisition import (
     Acquisition,
-    expected_alignment,
+    alignment_gain,
     information_gain,
     predict_answers,
     score_queries,
@@ -23,7 +23,7 @@ from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel
 FUNCTIONS: dict[str, Acquisition] = {
     "information gain": information_gain,
     "volume removal": volume_removal,
-    "expected alignment": expected_alignment,
+    "alignment gain": alignment_gain,
 }
 
 
@@ -41,7 +41,7 @@ def test_agree_with_brute_force(model: ResponseModel, n_options: int, generator:
     predicted = predict_answers(samples, queries, model)
     tau = getattr(model, "tau", None)
     gain, removal = information_gain(predicted, samples), volume_removal(predicted, samples)
-    alignment = expected_alignment(predicted, samples)
+    alignment = alignment_gain(predicted, samples)
     for b in range(2):
         omegas = samples[b].double().numpy()
         for c in range(6):
@@ -52,13 +52,23 @@ def test_agree_with_brute_force(model: ResponseModel, n_options: int, generator:
             assert float(removal[b, c]) == pytest.approx(
                 1 - sum(p**2 for p in probs.mean(0)), abs=1e-5
             )
-            total = 0.0
+            total = -float(omegas.mean(0) @ omegas.mean(0))
             for q in range(n_options):
                 weight = probs[:, q].sum()
                 if weight > 0:
                     posterior_mean = (probs[:, q] / weight) @ omegas
                     total += weight / len(omegas) * (posterior_mean @ posterior_mean)
             assert float(alignment[b, c]) == pytest.approx(total, abs=1e-5)
+
+
+def test_alignment_gain_of_a_narrow_belief_is_not_lost_in_rounding(generator: Generator) -> None:
+    samples = 0.01 * uniform_sphere((2, 150, 4), generator) + torch.tensor([1.0, 0.0, 0.0, 0.0])
+    samples = torch.nn.functional.normalize(samples, dim=-1)
+    queries, model = torch.randn(2, 6, 2, 4, generator=generator), Boltzmann(5.0)
+    gain = alignment_gain(predict_answers(samples, queries, model), samples)
+    samples, queries = samples.double(), queries.double()
+    exact = alignment_gain(predict_answers(samples, queries, model), samples)
+    assert (gain - exact).abs().max() < 1e-3 * exact.max()
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)

@@ -58,10 +58,11 @@ def volume_removal(predicted: Prediction, samples: Tensor) -> Tensor:
     return 1 - predicted.probs.mean(-2).square().sum(-1)
 
 
-def expected_alignment(predicted: Prediction, samples: Tensor) -> Tensor:
-    r"""Expected squared length of the mean belief after the answer.
+def alignment_gain(predicted: Prediction, samples: Tensor) -> Tensor:
+    r"""How much an answer is expected to add to the squared length of the mean belief.
 
-    .. math:: \sum_q P(q) \, \lVert E[\omega \mid q] \rVert^2
+    .. math:: \sum_q P(q) \, \lVert E[\omega \mid q] \rVert^2 - \lVert E[\omega] \rVert^2
+        = \sum_q P(q) \, \lVert E[\omega \mid q] - E[\omega] \rVert^2
 
     For unit ω, :math:`\lVert E[\omega] \rVert^2` is what the belief itself expects of its alignment
     (the mean cosine between its samples and the human's ω).
@@ -71,12 +72,14 @@ def expected_alignment(predicted: Prediction, samples: Tensor) -> Tensor:
         samples: (… M D), the belief samples.
 
     Returns:
-        (… C), between ‖E[ω]‖² and 1 for unit samples.
+        (… C), from 0 to 1 - ‖E[ω]‖² for unit samples.
     """
+    # About the mean: a small gain would drown in the rounding of two squares near 1.
+    centred = samples - samples.mean(-2, keepdim=True)
     total = torch.zeros_like(predicted.entropy)
     for probs in predicted.probs.unbind(-1):
-        joint_mean = probs @ samples / samples.shape[-2]
-        total += joint_mean.square().sum(-1) / probs.mean(-1).clamp(min=1e-30)
+        moved = probs @ centred / samples.shape[-2]
+        total += moved.square().sum(-1) / probs.mean(-1).clamp(min=1e-30)
     return total
 
 
@@ -146,9 +149,9 @@ def rank_offer(
     response_model: ResponseModel,
     *acquisitions: Acquisition,
 ) -> Tensor:
-    """The share of a reference set of queries that an offered query scores above.
+    """The share of a reference set of queries that an offered query scores above, and half a step.
 
-    Of several acquisition functions the mean counts, each in its standard deviations over the set.
+    Several acquisition functions are each standardised over offer and set, and averaged.
 
     Args:
         samples: (B M D), the belief.
@@ -158,10 +161,12 @@ def rank_offer(
         acquisitions: what makes the score, at least one.
 
     Returns:
-        (B 1), from 0 to 1.
+        (B 1), from 1/2N to 1 + 1/2N: half a step beyond the share, so that no rounding decides
+        whether it reaches another share.
     """
     queries = torch.cat([offer.unsqueeze(1), reference.expand(len(offer), *reference.shape)], 1)
     scores = score_queries(samples, queries, response_model, together(*acquisitions))
     score = standardise(scores).mean(-1)
-    # The margin keeps a query from outranking itself by rounding.
-    return (score[:, :1] > score[:, 1:] + 1e-3).float().mean(1, keepdim=True)
+    # A thousandth of a standard deviation keeps a query from outranking itself by rounding.
+    above = score[:, :1] > score[:, 1:] + 1e-3
+    return (above.sum(1, keepdim=True) + 0.5) / len(reference)

@@ -9,7 +9,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from tqdm import tqdm
 
-from torchrl_pref.acquisition import expected_alignment
+from torchrl_pref.acquisition import alignment_gain
 from torchrl_pref.checkpoint import Checkpoint
 from torchrl_pref.envs import FeedEnv, QueryEnv
 from torchrl_pref.errors import InputError, check_count, check_flag, check_seed
@@ -97,12 +97,12 @@ def compare(
     query_env = make_query_env(settings, task, pool, n_humans, seed)
     runs.append(("random", query_env, RandomQuery(seed + 1), False))
     runs.append(("greedy", query_env, Greedy(task.response_model), False))
-    by_alignment = Greedy(task.response_model, expected_alignment)
+    by_alignment = Greedy(task.response_model, alignment_gain)
     runs.append(("greedy alignment", query_env, by_alignment, False))
     if settings["setup"]["name"] == "feed":
         feed_env = make_feed_env(settings, task, pool, n_humans, seed)
         runs.append(("ask all", feed_env, RandomAsk(), False))
-        runs.append(("quantile", feed_env, QuantileAsk(feed_env, expected_alignment), False))
+        runs.append(("quantile", feed_env, QuantileAsk(feed_env, alignment_gain), False))
     for name, checkpoint in learned.items():
         env, policy = _load_policy(checkpoint, task, pool, n_humans, seed)
         sample = check_flag("policy.sample", checkpoint.settings["policy"]["sample"])

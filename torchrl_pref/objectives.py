@@ -16,7 +16,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_pref.acquisition import (
-    expected_alignment,
+    alignment_gain,
     information_gain,
     predict_answers,
     score_queries,
@@ -68,8 +68,7 @@ class Alignment(Objective):
         self, session: TensorDictBase, queries: Tensor, response_model: ResponseModel
     ) -> Tensor:
         """See :meth:`Objective.forecast`."""
-        later = score_queries(session["samples"], queries, response_model, expected_alignment)
-        return later - self.potential(session)
+        return score_queries(session["samples"], queries, response_model, alignment_gain)
 
 
 class TrueAlignment(Objective):

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torchrl.modules import MLP
 
 from torchrl_pref.acquisition import (
-    expected_alignment,
+    alignment_gain,
     information_gain,
     rank_offer,
     score_queries,
@@ -26,7 +26,7 @@ from torchrl_pref.envs import FeedEnv
 from torchrl_pref.errors import check_choice
 from torchrl_pref.objectives import OBJECTIVES
 from torchrl_pref.responses import ResponseModel
-from torchrl_pref.strategies import REFERENCE, asks_over_offers, reference_of
+from torchrl_pref.strategies import asks_over_offers, reference_of
 
 N_CANDIDATE = 7
 """F, see :class:`CandidateFeatures`."""
@@ -63,16 +63,15 @@ class CandidateFeatures(nn.Module):
             samples,
             queries,
             self.response_model,
-            together(information_gain, expected_alignment, volume_removal),
+            together(information_gain, alignment_gain, volume_removal),
         ).unbind(-1)
         centred = queries - queries.mean(-2, keepdim=True)
         covariance = covariance_of(samples)
         variance = ((centred @ covariance.unsqueeze(1)) * centred).sum((-2, -1))
         apart = (centred @ mean[:, None, :, None]).squeeze(-1).norm(dim=-1)
-        now = mean.square().sum(-1, keepdim=True)
         length = centred.square().sum((-2, -1)).sqrt()
         return torch.stack(
-            [gain, alignment - now, removal, variance.clamp(min=0).sqrt(), variance, apart, length],
+            [gain, alignment, removal, variance.clamp(min=0).sqrt(), variance, apart, length],
             -1,
         )
 
@@ -144,8 +143,8 @@ class OfferScorer(nn.Module):
         """From offer features (B F), its rank (B 1), the share of the best that is asked (B 1), how
         much later the asks to come are (B 1) and belief features (B G) to logits (B 2)."""
         eager = (share * (PATIENCE_SCALE * self.patience * later).exp()).clamp(max=1)
-        # Half a rank breaks ties in favour of asking; at a share of 1 all that are left are asked.
-        margin = rank - (1 - eager) + 0.5 / REFERENCE + (share >= 1)
+        # At a share of 1 all that are left are asked, for certain.
+        margin = rank - (1 - eager) + (share >= 1)
         correction = self.network(torch.cat([offer, rank, share, belief], -1))
         # The correction is in logits: in ranks, as small a step would be a large one.
         ask = self.log_scale.exp() * margin + correction
@@ -171,7 +170,7 @@ class OfferFeatures(nn.Module):
         """From samples (B M D), offer (B K D) and counts (B 1) to offer features (B F), the rank in
         information and alignment gain (B 1), asks left over offers left (B 1), and the log of the
         mean number of the asks left over that of the next (B 1)."""
-        gains = (information_gain, expected_alignment)
+        gains = (information_gain, alignment_gain)
         rank = rank_offer(samples, offer, self.reference, self.features.response_model, *gains)
         share = asks_over_offers(n_asked, n_offered, self.budget, self.n_offers)
         later = (0.5 + 0.5 * self.budget / (n_asked + 1)).clamp(min=1).log()

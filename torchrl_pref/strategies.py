@@ -185,8 +185,8 @@ class QuantileAsk(TensorDictModuleBase):
 
     Args:
         env: gives the response model, the pool and the budgets.
-        acquisitions: the value of an offer, information gain by default; of several functions the
-            mean counts, each in standard deviations.
+        acquisitions: the value of an offer, information gain by default; several functions are
+            standardised and averaged.
     """
 
     in_keys = ["samples", "offer", "n_asked", "n_offered"]

@@ -181,7 +181,7 @@ def test_soft_answers_are_never_left_out(generator: Generator) -> None:
 
 
 def test_narrow_posteriors_are_still_explored(generator: Generator) -> None:
-    """Twenty hard answers that halve the circle each time: an arc of a few millionths is left."""
+    """Fourteen hard answers halve the circle each time: an arc of under a thousandth is left."""
     sessions = 50
     belief = Belief(Optimal(tolerance=0.0))
     samples, ess = belief.prior(sessions, 2, generator), torch.full((sessions,), 100.0)

@@ -26,6 +26,7 @@ from tqdm import tqdm
 
 from torchrl_pref.acquisition import alignment_gain, information_gain, volume_removal
 from torchrl_pref.checkpoint import Checkpoint
+from torchrl_pref.comparison import FIRST_EVALUATION_SEED
 from torchrl_pref.envs import FeedEnv, QueryEnv
 from torchrl_pref.errors import InputError
 from torchrl_pref.evaluation import Evaluation, draw_humans, evaluate
@@ -51,9 +52,9 @@ from torchrl_pref.strategies import (
 
 POOLS, BALANCED_POOLS, HUMANS = 10, 3, 100
 
-FIRST_SEED = 2**31 + 10_000
-"""Of the pools and humans; training and its evaluation are below 2³¹. The pools from 2³¹ on were
-looked at while the feed's start was designed, and are no longer used."""
+FIRST_SEED = FIRST_EVALUATION_SEED + 10_000
+"""Of the pools and humans, out of reach of any training. The pools just below were looked at while
+the feed's start was designed, and are no longer used."""
 
 FINE_SAMPLES, FINE_HUMANS = 4000, 5
 """Greedy with 40 times the samples is 40 times the work: it faces a few humans of each pool."""
@@ -266,7 +267,7 @@ def run_side_by_side(
 def _run_pool(job: Job) -> dict[str, list[Evaluation]]:
     """Every strategy of a cell on one pool; a list holds one evaluation for each training seed."""
     task, pool = _task_and_pool(job)
-    # A seed of its own for each pool, out of reach of any training.
+    # A seed of its own for each pool.
     seed = FIRST_SEED + 1000 + job.pool
     make = make_feed_env if job.cell.setup == "feed" else make_query_env
 

@@ -12,7 +12,6 @@ from torchrl_pref.acquisition import (
     alignment_gain,
     information_gain,
     predict_answers,
-    rank_offer,
 )
 from torchrl_pref.envs import FeedEnv, QueryEnv
 from torchrl_pref.errors import InputError
@@ -22,6 +21,7 @@ from torchrl_pref.responses import ResponseModel
 from torchrl_pref.strategies import (
     Greedy,
     Lookahead,
+    OfferRank,
     QuantileAsk,
     RandomAsk,
     RandomQuery,
@@ -107,21 +107,37 @@ def test_rank_by_two_functions_is_by_their_mean_in_standard_deviations(pool: Que
     env = make(FeedEnv, pool, batch=40, skip="free")
     first, model = env.reset(), env.belief.response_model
     both = (information_gain, alignment_gain)
-    ranks = rank_offer(first["samples"], first["offer"], pool.features, model, *both)
+    rank_of = OfferRank(env, *both)
+    ranks = rank_of(first["samples"], first["offer"])
     for samples, offer, rank in zip(first["samples"], first["offer"], ranks, strict=True):
         queries = torch.cat([offer.unsqueeze(0), pool.features]).unsqueeze(0)
         predicted = predict_answers(samples.unsqueeze(0), queries, model)
         total = np.zeros(len(pool) + 1)
         for function in both:
             values = function(predicted, samples.unsqueeze(0))[0].double().numpy()
-            total += (values - values.mean()) / values.std()
+            total += (values - values[1:].mean()) / values[1:].std()
         assert rank.item() == pytest.approx(
             ((total[0] > total[1:] + 2e-3).sum() + 0.5) / len(pool), abs=1e-6
         )
-    itself = rank_offer(
-        first["samples"], pool.features[:1].expand(40, -1, -1), pool.features[:1], model, *both
-    )
-    assert (itself == 0.5).all()
+    # No query of the sample outranks itself: the best is above all but one.
+    own = [rank_of(first["samples"], query.expand(40, -1, -1)) for query in pool.features]
+    highest = (len(pool) - 0.5) / len(pool)
+    assert torch.stack(own).amax().item() == pytest.approx(highest, abs=1e-6)
+
+
+def test_rank_keeps_scores_only_while_the_belief_stays(pool: QueryPool) -> None:
+    env = make(FeedEnv, pool, batch=40, skip="free")
+    kept = OfferRank(env, information_gain)
+    data = env.rollout(8, RandomAsk(0.5), break_when_any_done=False)
+    asked = data["action"][:, :7] == 1
+    assert asked.any()
+    assert not asked.all()
+    for step in data.unbind(1):
+        anew = OfferRank(env, information_gain)(step["samples"], step["offer"])
+        assert torch.equal(kept(step["samples"], step["offer"]), anew)
+    few = data[:3, 0]
+    anew = OfferRank(env, information_gain)(few["samples"], few["offer"])
+    assert torch.equal(kept(few["samples"], few["offer"]), anew)
 
 
 @pytest.mark.parametrize("acquisition", [information_gain, alignment_gain])
@@ -129,13 +145,7 @@ def test_quantile_rule_uses_up_its_asks_on_the_best(acquisition: object, pool: Q
     env = make(FeedEnv, pool, batch=40, skip="free")
     data = env.rollout(25, QuantileAsk(env, acquisition), break_when_any_done=False)  # type: ignore[arg-type]
     first = data[:, 0]
-    rank = rank_offer(
-        first["samples"],
-        first["offer"],
-        pool.features,
-        env.belief.response_model,
-        acquisition,  # type: ignore[arg-type]
-    )
+    rank = OfferRank(env, acquisition)(first["samples"], first["offer"])  # type: ignore[arg-type]
     assert torch.equal(first["action"] == 1, rank.squeeze(-1) >= 1 - 5 / 25)
     asked = data["next", "n_asked"].squeeze(-1).amax(1)
     assert (asked == 5).all()

@@ -55,6 +55,7 @@ def settings_of(setup: str = "feed", policy: str = "scorer", **training: Any) ->
             "lmbda": 0.95,
             "entropy": 0.01,
             "critic": 0.5,
+            "critic_steps": 2,
             "grad_norm": 0.5,
             "warm_up": 1,
             "average": 0.9,
@@ -140,6 +141,26 @@ def test_gamma_counts_questions_where_skips_are_free(skip: str) -> None:
     discount = torch.where(asked | (skip == "regret"), 0.5, 1.0)
     target = batch["next", "reward"] + discount * later * ~batch["next", "terminated"]
     assert torch.allclose(batch["value_target"], target, atol=1e-3)
+
+
+def test_critic_steps_bring_the_critic_to_the_returns() -> None:
+    """Without them it still forecasts far too little when the policy begins to learn from it."""
+    errors = []
+    for critic_steps in (0, 20):
+        constants = {"sessions": 32, "steps": None, "optimizer": "adam", "learning_rate": 0.001}
+        settings = settings_of("query", critic_steps=critic_steps, warm_up=20, **constants)
+        trainer, _ = trainer_of(settings)
+        batches = iter(trainer.collector)
+        for _ in range(8):
+            trainer.update(next(batches))
+        batch = next(batches)  # whole sessions, from the first question to the last
+        returns = batch["next", "episode_reward"][:, -1]
+        with torch.no_grad():
+            forecast = trainer.policy.critic(batch.clone())["state_value"][:, 0]
+        errors.append(float((returns - forecast).mean().abs()))
+    plain, fitted = errors
+    assert fitted < 0.1
+    assert fitted < plain / 2
 
 
 def test_warm_up_spares_the_actor_and_the_average_follows() -> None:

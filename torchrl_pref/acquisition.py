@@ -136,37 +136,10 @@ def together(*functions: Acquisition) -> Acquisition:
     return lambda predicted, samples: torch.stack([f(predicted, samples) for f in functions], -1)
 
 
-def standardise(scores: Tensor) -> Tensor:
-    """Scores (B C V) less their mean, in their standard deviations, each over the C candidates."""
-    centred = scores - scores.mean(-2, keepdim=True)
-    return centred / centred.square().mean(-2, keepdim=True).sqrt().clamp(min=1e-6)
-
-
-def rank_offer(
-    samples: Tensor,
-    offer: Tensor,
-    reference: Tensor,
-    response_model: ResponseModel,
-    *acquisitions: Acquisition,
-) -> Tensor:
-    """The share of a reference set of queries that an offered query scores above, and half a step.
-
-    Several acquisition functions are each standardised over offer and set, and averaged.
-
-    Args:
-        samples: (B M D), the belief.
-        offer: (B K D), the offered query.
-        reference: (N K D), what may be offered.
-        response_model: how the belief thinks the human answers.
-        acquisitions: what makes the score, at least one.
-
-    Returns:
-        (B 1), from 1/2N to 1 + 1/2N: half a step beyond the share, so that no rounding decides
-        whether it reaches another share.
-    """
-    queries = torch.cat([offer.unsqueeze(1), reference.expand(len(offer), *reference.shape)], 1)
-    scores = score_queries(samples, queries, response_model, together(*acquisitions))
-    score = standardise(scores).mean(-1)
-    # A thousandth of a standard deviation keeps a query from outranking itself by rounding.
-    above = score[:, :1] > score[:, 1:] + 1e-3
-    return (above.sum(1, keepdim=True) + 0.5) / len(reference)
+def standardise(scores: Tensor, among: Tensor | None = None) -> Tensor:
+    """Scores (B C V) less a mean, in standard deviations: those of the C scores of each session,
+    or of other scores (B N V) that they are seen among."""
+    among = scores if among is None else among
+    mean = among.mean(-2, keepdim=True)
+    deviation = (among - mean).square().mean(-2, keepdim=True).sqrt()
+    return (scores - mean) / deviation.clamp(min=1e-6)

@@ -52,9 +52,9 @@ from torchrl_pref.strategies import (
 
 POOLS, BALANCED_POOLS, HUMANS = 10, 3, 100
 
-FIRST_SEED = FIRST_EVALUATION_SEED + 10_000
-"""Of the pools and humans, out of reach of any training. The pools just below were looked at while
-the feed's start was designed, and are no longer used."""
+FIRST_SEED = FIRST_EVALUATION_SEED + 20_000
+"""Of the pools and humans, out of reach of any training. The pools of the two bases below were
+looked at while the feed's policy was designed, and are no longer used."""
 
 FINE_SAMPLES, FINE_HUMANS = 4000, 5
 """Greedy with 40 times the samples is 40 times the work: it faces a few humans of each pool."""

@@ -178,13 +178,14 @@ def figure_2(histories: Mapping[str, Sequence[float]], path: Path) -> None:
 
 
 def training_figure(history: Mapping[str, Sequence[float]], path: Path) -> None:
-    """How training went: alignment, episode length and reward against the number of updates."""
+    """How training went: means over the episodes that ended (alignment, length, reward) and what
+    the critic knew of the returns, against the number of updates."""
     names = [name for name in history if name.startswith("train/")]
     figure, axes = plt.subplots(1, len(names), figsize=(4.2 * len(names), 3.4))
     for axis, name in zip(axes, names, strict=True):
         axis.plot(*smoothed(history[name], even_edges(len(history[name]))), color=STYLE["RL"][0])
         label = name.removeprefix("train/").replace("_", " ")
-        axis.set(xlabel="A2C updates", ylabel=label, title=f"{label}, mean over ended episodes")
+        axis.set(xlabel="A2C updates", ylabel=label)
         axis.grid(alpha=0.25)
     save_figure(figure, path)
 

@@ -15,7 +15,6 @@ from torchrl.modules import MLP
 from torchrl_pref.acquisition import (
     alignment_gain,
     information_gain,
-    rank_offer,
     score_queries,
     standardise,
     together,
@@ -26,7 +25,7 @@ from torchrl_pref.envs import FeedEnv
 from torchrl_pref.errors import check_choice
 from torchrl_pref.objectives import OBJECTIVES
 from torchrl_pref.responses import ResponseModel
-from torchrl_pref.strategies import asks_over_offers, reference_of
+from torchrl_pref.strategies import OfferRank, asks_over_offers
 
 N_CANDIDATE = 7
 """F, see :class:`CandidateFeatures`."""
@@ -162,7 +161,7 @@ class OfferFeatures(nn.Module):
         super().__init__()
         self.features = CandidateFeatures(env.belief.response_model)
         self.budget, self.n_offers = env.budget, env.n_offers
-        self.reference = reference_of(env)
+        self.rank = OfferRank(env, information_gain, alignment_gain)
 
     def forward(
         self, samples: Tensor, offer: Tensor, n_asked: Tensor, n_offered: Tensor
@@ -170,8 +169,7 @@ class OfferFeatures(nn.Module):
         """From samples (B M D), offer (B K D) and counts (B 1) to offer features (B F), the rank in
         information and alignment gain (B 1), asks left over offers left (B 1), and the log of the
         mean number of the asks left over that of the next (B 1)."""
-        gains = (information_gain, alignment_gain)
-        rank = rank_offer(samples, offer, self.reference, self.features.response_model, *gains)
+        rank = self.rank(samples, offer)
         share = asks_over_offers(n_asked, n_offered, self.budget, self.n_offers)
         later = (0.5 + 0.5 * self.budget / (n_asked + 1)).clamp(min=1).log()
         return self.features(samples, offer.unsqueeze(1)).squeeze(1), rank, share, later

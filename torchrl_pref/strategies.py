@@ -19,14 +19,15 @@ from torchrl_pref.acquisition import (
     Acquisition,
     information_gain,
     predict_answers,
-    rank_offer,
     score_queries,
+    standardise,
+    together,
 )
 from torchrl_pref.envs import FeedEnv
 from torchrl_pref.errors import check_count, check_share
 from torchrl_pref.responses import ResponseModel
 
-REFERENCE = 200
+REFERENCE = 500
 """Queries of the pool among which a feed strategy ranks an offer."""
 
 
@@ -194,23 +195,67 @@ class QuantileAsk(TensorDictModuleBase):
 
     def __init__(self, env: FeedEnv, *acquisitions: Acquisition) -> None:
         super().__init__()
-        self.response_model = env.belief.response_model
-        self.acquisitions = acquisitions or (information_gain,)
-        self.budget, self.n_offers, self.reference = env.budget, env.n_offers, reference_of(env)
+        self.rank = OfferRank(env, *acquisitions or (information_gain,))
+        self.budget, self.n_offers = env.budget, env.n_offers
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` (B)."""
         samples, offer, n_asked, n_offered = (tensordict[key] for key in self.in_keys)
-        rank = rank_offer(samples, offer, self.reference, self.response_model, *self.acquisitions)
+        rank = self.rank(samples, offer)
         share = asks_over_offers(n_asked, n_offered, self.budget, self.n_offers)
         return tensordict.set("action", (rank >= 1 - share).squeeze(-1).long())
 
 
-def reference_of(env: FeedEnv) -> Tensor:
-    """A sample (N K D) of what the environment may offer, spread evenly over its pool."""
-    features = env.features
-    places = torch.linspace(0, len(features) - 1, min(REFERENCE, len(features)))
-    return features[places.long().to(features.device)]
+class OfferRank:
+    """Where an offered query ranks in a sample of what the environment may offer.
+
+    Several acquisition functions are each standardised over the sample, and averaged. The sample's
+    scores are kept for as long as a session's belief stays the same, as it does with each skip.
+
+    Args:
+        env: gives the response model and the pool; the sample is spread evenly over it.
+        acquisitions: what makes the score, at least one.
+    """
+
+    def __init__(self, env: FeedEnv, *acquisitions: Acquisition) -> None:
+        self.response_model = env.belief.response_model
+        self.acquisition, self.n_scores = together(*acquisitions), len(acquisitions)
+        places = torch.linspace(0, len(env.features) - 1, min(REFERENCE, len(env.features)))
+        self.reference = env.features[places.long().to(env.features.device)]
+        self._samples, self._scores = torch.empty(0), torch.empty(0)
+
+    def __call__(self, samples: Tensor, offer: Tensor) -> Tensor:
+        """The share of the sample that the offer scores above, and half a step beyond, so that no
+        rounding decides whether it reaches another share.
+
+        Args:
+            samples: (B M D), the belief.
+            offer: (B K D), the offered query.
+
+        Returns:
+            (B 1), from 1/2N to 1 + 1/2N for a sample of N.
+        """
+        scores = self._score_reference(samples)
+        score = self._score(samples, offer.unsqueeze(1))
+        value = standardise(score, scores).mean(-1)
+        # A thousandth of a standard deviation keeps a query from outranking itself by rounding.
+        above = value > standardise(scores).mean(-1) + 1e-3
+        return (above.sum(1, keepdim=True) + 0.5) / len(self.reference)
+
+    def _score_reference(self, samples: Tensor) -> Tensor:
+        """The sample's scores (B N V), made anew for the sessions whose belief is another."""
+        if self._samples.shape != samples.shape or self._samples.device != samples.device:
+            self._samples = torch.full_like(samples, torch.nan)
+            self._scores = samples.new_empty(len(samples), len(self.reference), self.n_scores)
+        changed = (self._samples != samples).flatten(1).any(1)
+        if changed.any():
+            reference = self.reference.expand(int(changed.sum()), *self.reference.shape)
+            self._scores[changed] = self._score(samples[changed], reference)
+            self._samples[changed] = samples[changed]
+        return self._scores
+
+    def _score(self, samples: Tensor, queries: Tensor) -> Tensor:
+        return score_queries(samples, queries, self.response_model, self.acquisition)
 
 
 def asks_over_offers(n_asked: Tensor, n_offered: Tensor, budget: int, n_offers: int) -> Tensor:

@@ -17,6 +17,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
@@ -38,6 +39,9 @@ METRICS = {
 }
 """What is averaged over the episodes that end in a batch, by the key that holds it."""
 
+OF_BATCH = ("train/explained_variance", "time/frames_per_second")
+"""What is told of the batch as a whole."""
+
 
 @dataclass(frozen=True)
 class A2CSettings:
@@ -46,7 +50,7 @@ class A2CSettings:
     Attributes:
         updates: gradient steps in all.
         sessions: B, humans questioned side by side.
-        steps: T, steps of each session between two updates.
+        steps: T, steps of each session between two updates; None: as many as a session may take.
         optimizer: ``adam`` or ``rmsprop``.
         learning_rate: of the optimizer.
         gamma: discount of the reward for each step; where skips are free, for each question.
@@ -54,6 +58,9 @@ class A2CSettings:
         entropy: coefficient of the entropy bonus.
         critic: coefficient of the critic's squared error.
         grad_norm: the gradient is clipped to this length.
+        critic_steps: gradient steps of the critic alone after each update, on as many parts of the
+            batch. With few, the critic is for long far from the returns that it is to forecast, and
+            what the policy learns is the critic's error.
         warm_up: updates, of the first, in which only the critic learns: a policy that starts from a
             good strategy is not to be judged by a critic that knows nothing.
         average: share of the old that the moving average of the weights keeps at each update; the
@@ -66,22 +73,26 @@ class A2CSettings:
 
     updates: int
     sessions: int
-    steps: int
+    steps: int | None
     optimizer: str
     learning_rate: float
     gamma: float
     lmbda: float
     entropy: float
     critic: float
+    critic_steps: int
     grad_norm: float
     warm_up: int
     average: float
     save_every: int
 
     def __post_init__(self) -> None:
-        for name in ("updates", "sessions", "steps", "save_every"):
+        for name in ("updates", "sessions", "save_every"):
             check_count(f"training.{name}", getattr(self, name), 1)
-        check_count("training.warm_up", self.warm_up, 0)
+        if self.steps is not None:
+            check_count("training.steps", self.steps, 1)
+        for name in ("critic_steps", "warm_up"):
+            check_count(f"training.{name}", getattr(self, name), 0)
         for name in ("learning_rate", "critic", "grad_norm"):
             check_positive(f"training.{name}", getattr(self, name))
         for name in ("gamma", "lmbda", "entropy", "average"):
@@ -100,7 +111,7 @@ class Progress:
 
     update: int = 0
     history: dict[str, list[float]] = field(
-        default_factory=lambda: {name: [] for name in (*METRICS, "time/frames_per_second")}
+        default_factory=lambda: {name: [] for name in (*METRICS, *OF_BATCH)}
     )
 
 
@@ -141,11 +152,12 @@ class Trainer:
             self.optimizer = torch.optim.RMSprop(
                 self.loss.parameters(), settings.learning_rate, alpha=0.99, eps=1e-5
             )
+        steps = settings.steps or (env.n_offers if isinstance(env, FeedEnv) else env.budget)
         transforms = Compose(RewardSum(), StepCounter())
         self.collector = Collector(
             TransformedEnv(env, transforms),
             policy.strategy,
-            frames_per_batch=settings.sessions * settings.steps,
+            frames_per_batch=settings.sessions * steps,
             total_frames=-1,
             track_traj_ids=False,
             auto_register_policy_transforms=False,
@@ -172,6 +184,7 @@ class Trainer:
                 self.update(batch)
                 progress.update += 1
                 metrics = _episode_metrics(batch)
+                metrics["train/explained_variance"] = _explained_variance(batch)
                 metrics["time/frames_per_second"] = batch.numel() / (time.perf_counter() - start)
                 for name, value in metrics.items():
                     progress.history[name].append(value)
@@ -192,15 +205,28 @@ class Trainer:
             batch["steps_to_next_obs"] = batch["next", "n_asked"] - batch["n_asked"]
         with torch.no_grad():
             self.advantage(batch)
-        losses = self.loss(batch.reshape(-1))
+        flat = batch.reshape(-1)
+        losses = self.loss(flat)
         learning = "loss_critic" if self.progress.update < self.settings.warm_up else "loss_"
         total = sum(value for key, value in losses.items() if key.startswith(learning))
-        self.optimizer.zero_grad()
-        total.backward()
-        clip_grad_norm_(self.loss.parameters(), self.settings.grad_norm)
-        self.optimizer.step()
+        self._descend(total)
+        self._fit_critic(flat)
         for name, weight in self.policy.weights.state_dict().items():
             self.average[name].lerp_(weight, 1 - self.settings.average)
+
+    def _fit_critic(self, flat: TensorDictBase) -> None:
+        """Bring the critic nearer to the returns of a batch (BT), in one pass over it."""
+        if self.settings.critic_steps:
+            shown = flat.select(*self.policy.critic.in_keys, "value_target")
+            for part in torch.randperm(len(shown)).chunk(self.settings.critic_steps):
+                self._descend(self.loss.loss_critic(shown[part])[0].mean())
+
+    def _descend(self, loss: Tensor) -> None:
+        """One step of the optimizer, for the weights that the loss depends on."""
+        self.optimizer.zero_grad()
+        loss.backward()
+        clip_grad_norm_(self.loss.parameters(), self.settings.grad_norm)
+        self.optimizer.step()
 
     def start_average(self) -> None:
         """Begin the average of the weights with what the policy holds now."""
@@ -236,6 +262,13 @@ def _episode_metrics(batch: TensorDictBase) -> dict[str, float]:
     """Means over the episodes that ended in a batch; NaN where none did."""
     done = batch["next", "done"]
     return {name: batch["next", key][done].float().mean().item() for name, key in METRICS.items()}
+
+
+def _explained_variance(batch: TensorDictBase) -> float:
+    """The share of the variance of the returns that the critic knew of: 1 is all, 0 nothing; a
+    critic that only adds to it, as in the first updates, is never put below -1."""
+    target, value = batch["value_target"], batch["state_value"]
+    return max(-1.0, float(1 - (target - value).var() / target.var().clamp(min=1e-12)))
 
 
 def _latest(history: dict[str, list[float]]) -> dict[str, str]:

@@ -6,7 +6,7 @@ import torch
 from conftest import RESPONSE_MODELS
 from test_envs import make
 from test_policies import session_of
-from torch import Generator
+from torch import Generator, Tensor
 
 from torchrl_pref.acquisition import (
     alignment_gain,
@@ -17,7 +17,7 @@ from torchrl_pref.envs import FeedEnv, QueryEnv
 from torchrl_pref.errors import InputError
 from torchrl_pref.objectives import make_objective
 from torchrl_pref.queries import QueryPool
-from torchrl_pref.responses import ResponseModel
+from torchrl_pref.responses import Prediction, ResponseModel
 from torchrl_pref.strategies import (
     Greedy,
     Lookahead,
@@ -138,6 +138,20 @@ def test_rank_keeps_scores_only_while_the_belief_stays(pool: QueryPool) -> None:
     few = data[:3, 0]
     anew = OfferRank(env, information_gain)(few["samples"], few["offer"])
     assert torch.equal(kept(few["samples"], few["offer"]), anew)
+    # Nothing but the offer is scored while no belief changes, and one session where one does.
+    scored: list[tuple[int, ...]] = []
+
+    def watched(predicted: Prediction, samples: Tensor) -> Tensor:
+        scored.append(tuple(predicted.entropy.shape))
+        return information_gain(predicted, samples)
+
+    rank = OfferRank(env, watched)
+    rank(few["samples"], few["offer"])
+    rank(few["samples"], few["offer"])
+    other = few["samples"].clone()
+    other[1] = -other[1]
+    rank(other, few["offer"])
+    assert scored == [(3, len(pool)), (3, 1), (3, 1), (1, len(pool)), (3, 1)]
 
 
 @pytest.mark.parametrize("acquisition", [information_gain, alignment_gain])

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from torchrl_pref.checkpoint import Checkpoint
 from torchrl_pref.errors import InputError
@@ -20,7 +21,7 @@ from torchrl_pref.experiment import (
     reload_task,
 )
 from torchrl_pref.queries import QueryPool, gridworld_pool
-from torchrl_pref.training import Trainer
+from torchrl_pref.training import Trainer, _explained_variance
 
 
 def settings_of(setup: str = "feed", policy: str = "scorer", **training: Any) -> dict[str, Any]:
@@ -163,6 +164,23 @@ def test_critic_steps_bring_the_critic_to_the_returns() -> None:
     assert fitted < plain / 2
 
 
+@pytest.mark.parametrize("setup", ["query", "feed"])
+def test_a_batch_has_the_steps_a_session_may_take(setup: str) -> None:
+    trainer, _ = trainer_of(settings_of(setup, steps=None))
+    batch = next(iter(trainer.collector))
+    assert batch.shape == (4, 4 if setup == "query" else 20)
+    assert batch["next", "done"].any(1).all()
+
+
+def test_explained_variance_is_the_critics_share_of_the_returns() -> None:
+    target = torch.tensor([0.0, 1.0, 2.0, 3.0])
+    shares = []
+    for value in (target, torch.ones(4), target.mean() + (target - target.mean()) / 2, -9 * target):
+        batch = TensorDict({"value_target": target, "state_value": value}, [4])
+        shares.append(_explained_variance(batch))
+    assert shares == pytest.approx([1, 0, 0.75, -1])
+
+
 def test_warm_up_spares_the_actor_and_the_average_follows() -> None:
     trainer, _ = trainer_of(settings_of(warm_up=2, average=0.9, learning_rate=0.01))
     weights = trainer.policy.weights
@@ -210,6 +228,8 @@ def test_ctrl_c_stops_after_the_update_and_saves(tmp_path: Path) -> None:
     [
         ("updates", 0),
         ("sessions", 2.5),
+        ("steps", 0),
+        ("critic_steps", -1),
         ("learning_rate", -1),
         ("gamma", 1.5),
         ("optimizer", "sgd"),

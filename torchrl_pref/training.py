@@ -48,7 +48,7 @@ class A2CSettings:
     """The constants of A2C.
 
     Attributes:
-        updates: gradient steps in all.
+        updates: batches; the policy takes one gradient step on each.
         sessions: B, humans questioned side by side.
         steps: T, steps of each session between two updates; None: as many as a session may take.
         optimizer: ``adam`` or ``rmsprop``.
@@ -57,10 +57,10 @@ class A2CSettings:
         lmbda: of generalised advantage estimation, for each step; 1 is the plain advantage.
         entropy: coefficient of the entropy bonus.
         critic: coefficient of the critic's squared error.
+        critic_steps: gradient steps, at most, of the critic alone after each update, on as many
+            parts of the batch. With few, the critic is for long far from the returns that it is to
+            forecast, and what the policy learns is the critic's error.
         grad_norm: the gradient is clipped to this length.
-        critic_steps: gradient steps of the critic alone after each update, on as many parts of the
-            batch. With few, the critic is for long far from the returns that it is to forecast, and
-            what the policy learns is the critic's error.
         warm_up: updates, of the first, in which only the critic learns: a policy that starts from a
             good strategy is not to be judged by a critic that knows nothing.
         average: share of the old that the moving average of the weights keeps at each update; the
@@ -199,7 +199,7 @@ class Trainer:
         return progress.update >= settings.updates
 
     def update(self, batch: TensorDictBase) -> None:
-        """One A2C step on a batch (B T) of transitions."""
+        """One A2C step on a batch (B T) of transitions, and the critic's own."""
         if getattr(self.env, "skip", None) == "free":
             # A free skip takes none of the human's time: gamma discounts by the question.
             batch["steps_to_next_obs"] = batch["next", "n_asked"] - batch["n_asked"]
@@ -268,7 +268,8 @@ def _explained_variance(batch: TensorDictBase) -> float:
     """The share of the variance of the returns that the critic knew of: 1 is all, 0 nothing; a
     critic that only adds to it, as in the first updates, is never put below -1."""
     target, value = batch["value_target"], batch["state_value"]
-    return max(-1.0, float(1 - (target - value).var() / target.var().clamp(min=1e-12)))
+    left = (target - value).var(correction=0) / target.var(correction=0).clamp(min=1e-12)
+    return (1 - left).clamp(min=-1).item()
 
 
 def _latest(history: dict[str, list[float]]) -> dict[str, str]:

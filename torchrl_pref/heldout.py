@@ -59,6 +59,12 @@ looked at while the feed's policy was designed, and are no longer used."""
 FINE_SAMPLES, FINE_HUMANS = 4000, 5
 """Greedy with 40 times the samples is 40 times the work: it faces a few humans of each pool."""
 
+RUNS = 3
+"""Of each rival, on the same humans: one run tells its alignment to no better than .005."""
+
+RIVALS = ("greedy", "threshold", "quantile of information", "quantile of alignment")
+"""How the names of the strategies begin that policies are held against."""
+
 THRESHOLDS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5)
 """Bits; the best on the training pool is the fixed threshold of the feed."""
 
@@ -83,7 +89,7 @@ class Cell(NamedTuple):
 
 @dataclass
 class Outcome:
-    """What a strategy did on P pools, with S policies of different training seeds.
+    """What a strategy did on P pools, with S policies of different training seeds, or in S runs.
 
     Attributes:
         alignment: (P S B H+1).
@@ -265,7 +271,8 @@ def run_side_by_side(
 
 
 def _run_pool(job: Job) -> dict[str, list[Evaluation]]:
-    """Every strategy of a cell on one pool; a list holds one evaluation for each training seed."""
+    """Every strategy of a cell on one pool; a list holds one evaluation for each training seed of
+    the policies, and for each run of a baseline."""
     task, pool = _task_and_pool(job)
     # A seed of its own for each pool.
     seed = FIRST_SEED + 1000 + job.pool
@@ -277,7 +284,14 @@ def _run_pool(job: Job) -> dict[str, list[Evaluation]]:
     env = make_env(HUMANS)
     humans = draw_humans(env)
     strategies = _baselines(job, task, env, seed)
+    runs = {name: [name] for name in strategies}
+    for run in range(2, RUNS + 1):
+        for name, strategy in _baselines(job, task, env, seed).items():
+            if name.startswith(RIVALS):
+                runs[name].append(f"{name}, run {run}")
+                strategies[runs[name][-1]] = strategy
     for number, checkpoint in enumerate(job.learned):
+        runs.setdefault("RL", []).append(f"RL {number}")
         strategies[f"RL {number}"] = load_policy(checkpoint, env).strategy
     found = run_side_by_side(make_env, humans, strategies)
     if job.cell.setup == "query" and job.cell.features == "corners":
@@ -290,8 +304,9 @@ def _run_pool(job: Job) -> dict[str, list[Evaluation]]:
         belief = {**job.settings["belief"], "samples": FINE_SAMPLES}
         fine = partial(make_env, settings={**job.settings, "belief": belief})
         found |= run_side_by_side(fine, humans[:FINE_HUMANS].select("human"), greedy)
-    learned = [found.pop(f"RL {number}") for number in range(len(job.learned))]
-    return {name: [result] for name, result in found.items()} | {"RL": learned}
+    learned = [found.pop(one) for one in runs.pop("RL")]
+    repeated = {name: [found.pop(one) for one in ones] for name, ones in runs.items()}
+    return repeated | {name: [result] for name, result in found.items()} | {"RL": learned}
 
 
 def _baselines(

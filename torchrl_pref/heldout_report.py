@@ -1,6 +1,6 @@
 """Tables and the figure of the held-out protocol.
 
-Shapes: P test pools, S training seeds, B humans, H query budget.
+Shapes: P test pools, S training seeds (of a baseline: runs), B humans, H query budget.
 """
 
 from __future__ import annotations
@@ -36,10 +36,11 @@ def curve(outcome: Outcome) -> Tensor:
 
 
 def paired(outcome: Outcome, other: Outcome) -> Tensor:
-    """Difference of the curves on the same humans (P S H+1)."""
+    """Difference of the curves on the same humans, to the mean of the other's runs (P S H+1)."""
     # Where one of them met fewer humans, these are the first of the other's.
     count = min(outcome.alignment.shape[2], other.alignment.shape[2])
-    return (outcome.alignment[:, :, :count] - other.alignment[:, :, :count]).mean(2)
+    runs = other.alignment[:, :, :count].mean(1, keepdim=True)
+    return (outcome.alignment[:, :, :count] - runs).mean(2)
 
 
 def reaches(outcome: Outcome, level: float) -> str:

@@ -38,7 +38,7 @@ STYLE = {
 NAMES = {
     "greedy": "greedy information gain",
     "ask all": "ask all (feed)",
-    "quantile": "quantile rule (feed)",
+    "quantile": "quantile of alignment (feed)",
 }
 
 

@@ -121,7 +121,7 @@ class QueryScorer(nn.Module):
 
 
 class OfferScorer(nn.Module):
-    """The logits of skip and ask for one offer, started at the budget-aware quantile rule.
+    """The logits of skip and ask for one offer, started at a budget-aware quantile rule.
 
     That rule asks if the offer ranks among the best share of a reference sample of the pool, the
     share being asks left over offers left. Here the rank is by information and expected alignment

@@ -100,6 +100,11 @@ class SessionEnv(EnvBase):
             self._set_seed(self._generator.initial_seed())
         return self._generator
 
+    @property
+    def max_steps(self) -> int:
+        """Steps after which every session has ended."""
+        return self.budget
+
     def _reset(
         self, tensordict: TensorDictBase | None = None, set_state: bool = False, **kwargs: Any
     ) -> TensorDictBase:
@@ -327,6 +332,11 @@ class FeedEnv(SessionEnv):
             self.n_offers = check_count("setup.offers", offers, budget)
         self.on_skip = check_choice("setup.on_skip", on_skip, ("new", "repeat"))
         self._make_specs(2)
+
+    @property
+    def max_steps(self) -> int:
+        """O: a session that asks less sees every offer."""
+        return self.n_offers
 
     def _fresh_state(self) -> TensorDict:
         state = super()._fresh_state()

@@ -67,13 +67,12 @@ def evaluate(
         sample: whether a stochastic policy draws its actions or takes the most likely one.
     """
     mode = ExplorationType.RANDOM if sample else ExplorationType.DETERMINISTIC
-    steps = env.n_offers if isinstance(env, FeedEnv) else env.budget
     session = env.reset(humans.clone(), set_state=True)
     before = {name: session["metrics", name].cpu() for name in CURVES}
     start = time.perf_counter()
     with torch.no_grad(), set_exploration_type(mode):
         steps_taken = env.rollout(
-            steps,
+            env.max_steps,
             strategy,
             auto_reset=False,
             tensordict=session,

@@ -284,30 +284,29 @@ def _run_pool(job: Job) -> dict[str, list[Evaluation]]:
 
     env = make_env(HUMANS)
     humans = draw_humans(env)
-    strategies = _baselines(job, task, env, seed)
-    runs = {name: [name] for name in strategies}
-    for run in range(2, RUNS + 1 if job.cell.features == "corners" else 2):
-        for name, strategy in _baselines(job, task, env, seed).items():
-            if name.startswith(RIVALS):
-                runs[name].append(f"{name}, run {run}")
-                strategies[runs[name][-1]] = strategy
-    for number, checkpoint in enumerate(job.learned):
-        runs.setdefault("RL", []).append(f"RL {number}")
-        strategies[f"RL {number}"] = load_policy(checkpoint, env).strategy
-    found = run_side_by_side(make_env, humans, strategies)
+    lineup = list(_baselines(job, task, env, seed).items())
+    for _ in range(1, RUNS if job.cell.features == "corners" else 1):
+        again = _baselines(job, task, env, seed).items()
+        lineup += [(name, strategy) for name, strategy in again if name.startswith(RIVALS)]
+    lineup += [("RL", load_policy(one, env).strategy) for one in job.learned]
+    numbered = {str(number): strategy for number, (_, strategy) in enumerate(lineup)}
+    results: dict[str, list[Evaluation]] = {}
+    found = run_side_by_side(make_env, humans, numbered)
+    for (name, _), result in zip(lineup, found.values(), strict=True):
+        results.setdefault(name, []).append(result)
+    learned = results.pop("RL")  # their row is the last
     if job.cell.setup == "query" and job.cell.features == "corners":
         greedy = {"greedy information, no repeats": Greedy(task.response_model)}
         setup = {**job.settings["setup"], "repeats": False}
         unrepeated = partial(make_env, settings={**job.settings, "setup": setup})
-        found |= run_side_by_side(unrepeated, humans, greedy)
+        extra = run_side_by_side(unrepeated, humans, greedy)
         name = f"greedy information, M={FINE_SAMPLES} ({FINE_HUMANS} humans a pool)"
         greedy = {name: Greedy(task.response_model)}
         belief = {**job.settings["belief"], "samples": FINE_SAMPLES}
         fine = partial(make_env, settings={**job.settings, "belief": belief})
-        found |= run_side_by_side(fine, humans[:FINE_HUMANS].select("human"), greedy)
-    learned = [found.pop(one) for one in runs.pop("RL")]
-    repeated = {name: [found.pop(one) for one in ones] for name, ones in runs.items()}
-    return repeated | {name: [result] for name, result in found.items()} | {"RL": learned}
+        extra |= run_side_by_side(fine, humans[:FINE_HUMANS].select("human"), greedy)
+        results |= {name: [result] for name, result in extra.items()}
+    return results | {"RL": learned}
 
 
 def _baselines(

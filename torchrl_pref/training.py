@@ -152,7 +152,7 @@ class Trainer:
             self.optimizer = torch.optim.RMSprop(
                 self.loss.parameters(), settings.learning_rate, alpha=0.99, eps=1e-5
             )
-        steps = settings.steps or (env.n_offers if isinstance(env, FeedEnv) else env.budget)
+        steps = settings.steps or env.max_steps
         transforms = Compose(RewardSum(), StepCounter())
         self.collector = Collector(
             TransformedEnv(env, transforms),

@@ -85,8 +85,15 @@ def test_protocol_pairs_all_strategies_on_pools_of_its_own(
     cell = Cell(setup, "noisy")
     learned = [checkpoint_of({**settings, "seed": seed}) for seed in (0, 1)]
     rows = [heldout._run_pool(Job(settings, cell, pool, learned, (0.2,))) for pool in (0, 1)]
+    rival, once = (
+        ("greedy alignment", "random") if setup == "query" else ("quantile of alignment", "ask all")
+    )
     for row in rows:
-        assert len(row["RL"]) == 2
+        assert list(row)[-1] == "RL"
+        assert [len(row[name]) for name in (rival, once, "RL")] == [heldout.RUNS, 1, 2]
+        if setup == "feed":  # one name alone takes every offer
+            assert (row[once][0].offered == row[once][0].asked).all()
+            assert (row[rival][0].offered > row[rival][0].asked).any()
         # All start from the same prior samples of the same humans.
         start = row["RL"][0].alignment[:, 0]
         for name, results in row.items():

@@ -4,6 +4,7 @@ from conftest import RESPONSE_MODELS
 from tensordict import TensorDictBase
 from test_envs import ENVS, make
 from torch import Generator
+from torch.nn import functional as F
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_pref.acquisition import alignment_gain, information_gain
@@ -85,25 +86,39 @@ def test_offer_scorer_starts_as_the_quantile_rule(model: ResponseModel, pool: Qu
     assert 0.05 < data["action"].float().mean() < 0.95
 
 
-def test_patience_asks_early_and_waits_late(pool: QueryPool) -> None:
-    env = make(FeedEnv, pool, batch=200, skip="free")
-    policy = scorer_policy(env)
-    session = session_of(env)
-    before = policy.strategy(session.clone())["logits"]
+def with_patience(policy: Policy, *patience: float) -> Policy:
+    """The same policy, its patience set: for later asks, and for a belief that is unsure."""
     with torch.no_grad():
         for name, weight in policy.weights.named_parameters():
             if name.endswith("patience"):
-                weight.fill_(0.05)
-    after = policy.strategy(session.clone())["logits"]
+                weight.copy_(torch.tensor(patience))
+    return policy
+
+
+def test_patience_asks_early_and_waits_late(pool: QueryPool) -> None:
+    env = make(FeedEnv, pool, batch=200, skip="free")
+    policy, session = scorer_policy(env), session_of(env)
+    before = policy.strategy(session.clone())["logits"]
+    after = with_patience(policy, 0.05, 0.0).strategy(session.clone())["logits"]
     assert (after[:, 1] > before[:, 1]).all()
     # The last ask gets no more of the offers than the rule gives it.
     session["n_asked"].fill_(env.budget - 1)
     late = policy.strategy(session.clone())["logits"]
-    with torch.no_grad():
-        for name, weight in policy.weights.named_parameters():
-            if name.endswith("patience"):
-                weight.zero_()
-    assert torch.allclose(late, policy.strategy(session)["logits"], atol=1e-5)
+    rule = with_patience(policy, 0.0, 0.0).strategy(session)["logits"]
+    assert torch.allclose(late, rule, atol=1e-5)
+
+
+def test_patience_waits_when_the_belief_is_sure(pool: QueryPool) -> None:
+    env = make(FeedEnv, pool, batch=200, skip="free")
+    policy, session = scorer_policy(env), session_of(env)
+    sure = session.clone()
+    # All samples near one another: the expected misalignment is far below 1/e.
+    sure["samples"] = F.normalize(session["samples"][:, :1] + 0.1 * session["samples"], dim=-1)
+    rule = [policy.strategy(each.clone())["logits"][:, 1] for each in (session, sure)]
+    policy = with_patience(policy, 0.0, 0.05)
+    after = [policy.strategy(each.clone())["logits"][:, 1] for each in (session, sure)]
+    assert (after[0] > rule[0]).all()
+    assert (after[1] < rule[1]).all()
 
 
 @pytest.mark.parametrize("kind", ENVS)

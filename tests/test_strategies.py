@@ -103,24 +103,25 @@ def test_threshold_asks_above_it_and_at_the_end(pool: QueryPool) -> None:
         assert torch.equal(data["action"][:, step] == 1, asks)
 
 
-def test_rank_by_two_functions_is_by_their_mean_in_standard_deviations(pool: QueryPool) -> None:
+@pytest.mark.parametrize("left", [1.0, 0.25])
+def test_rank_by_two_functions_weighs_them_by_the_asks_left(left: float, pool: QueryPool) -> None:
     env = make(FeedEnv, pool, batch=40, skip="free")
     first, model = env.reset(), env.belief.response_model
-    both = (information_gain, alignment_gain)
-    rank_of = OfferRank(env, *both)
-    ranks = rank_of(first["samples"], first["offer"])
+    weights = {information_gain: left, alignment_gain: 1 - left}
+    rank_of, share = OfferRank(env, information_gain, alignment_gain), torch.full((40, 1), left)
+    ranks = rank_of(first["samples"], first["offer"], share)
     for samples, offer, rank in zip(first["samples"], first["offer"], ranks, strict=True):
         queries = torch.cat([offer.unsqueeze(0), pool.features]).unsqueeze(0)
         predicted = predict_answers(samples.unsqueeze(0), queries, model)
         total = np.zeros(len(pool) + 1)
-        for function in both:
+        for function, weight in weights.items():
             values = function(predicted, samples.unsqueeze(0))[0].double().numpy()
-            total += (values - values[1:].mean()) / values[1:].std()
+            total += weight * (values - values[1:].mean()) / values[1:].std()
         assert rank.item() == pytest.approx(
-            ((total[0] > total[1:] + 2e-3).sum() + 0.5) / len(pool), abs=1e-6
+            ((total[0] > total[1:] + 1e-3).sum() + 0.5) / len(pool), abs=1e-6
         )
     # No query of the sample outranks itself: the best is above all but one.
-    own = [rank_of(first["samples"], query.expand(40, -1, -1)) for query in pool.features]
+    own = [rank_of(first["samples"], query.expand(40, -1, -1), share) for query in pool.features]
     highest = (len(pool) - 0.5) / len(pool)
     assert torch.stack(own).amax().item() == pytest.approx(highest, abs=1e-6)
 
@@ -133,11 +134,11 @@ def test_rank_keeps_scores_only_while_the_belief_stays(pool: QueryPool) -> None:
     assert asked.any()
     assert not asked.all()
     for step in data.unbind(1):
-        anew = OfferRank(env, information_gain)(step["samples"], step["offer"])
-        assert torch.equal(kept(step["samples"], step["offer"]), anew)
-    few = data[:3, 0]
-    anew = OfferRank(env, information_gain)(few["samples"], few["offer"])
-    assert torch.equal(kept(few["samples"], few["offer"]), anew)
+        now = step["samples"], step["offer"], torch.ones(40, 1)
+        assert torch.equal(kept(*now), OfferRank(env, information_gain)(*now))
+    few, left = data[:3, 0], torch.ones(3, 1)
+    now = few["samples"], few["offer"], left
+    assert torch.equal(kept(*now), OfferRank(env, information_gain)(*now))
     # Nothing but the offer is scored while no belief changes, and one session where one does.
     scored: list[tuple[int, ...]] = []
 
@@ -146,12 +147,24 @@ def test_rank_keeps_scores_only_while_the_belief_stays(pool: QueryPool) -> None:
         return information_gain(predicted, samples)
 
     rank = OfferRank(env, watched)
-    rank(few["samples"], few["offer"])
-    rank(few["samples"], few["offer"])
+    rank(*now)
+    rank(*now)
     other = few["samples"].clone()
     other[1] = -other[1]
-    rank(other, few["offer"])
+    rank(other, few["offer"], left)
     assert scored == [(3, len(pool)), (3, 1), (3, 1), (1, len(pool)), (3, 1)]
+
+
+def test_quantile_rule_turns_from_one_value_to_the_other(pool: QueryPool) -> None:
+    env = make(FeedEnv, pool, batch=200, skip="free")
+    rule = QuantileAsk(env, information_gain, late=alignment_gain)
+    rank = OfferRank(env, information_gain, late=alignment_gain)
+    session = env.reset()
+    for asked in range(5):
+        session["n_asked"].fill_(asked)
+        left = torch.full((200, 1), 1 - asked / 5)
+        expected = rank(session["samples"], session["offer"], left) >= 1 - (5 - asked) / 25
+        assert torch.equal(rule(session.clone())["action"] == 1, expected.squeeze(-1))
 
 
 @pytest.mark.parametrize("acquisition", [information_gain, alignment_gain])
@@ -159,7 +172,8 @@ def test_quantile_rule_uses_up_its_asks_on_the_best(acquisition: object, pool: Q
     env = make(FeedEnv, pool, batch=40, skip="free")
     data = env.rollout(25, QuantileAsk(env, acquisition), break_when_any_done=False)  # type: ignore[arg-type]
     first = data[:, 0]
-    rank = OfferRank(env, acquisition)(first["samples"], first["offer"])  # type: ignore[arg-type]
+    left = torch.ones(40, 1)
+    rank = OfferRank(env, acquisition)(first["samples"], first["offer"], left)  # type: ignore[arg-type]
     assert torch.equal(first["action"] == 1, rank.squeeze(-1) >= 1 - 5 / 25)
     asked = data["next", "n_asked"].squeeze(-1).amax(1)
     assert (asked == 5).all()

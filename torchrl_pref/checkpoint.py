@@ -15,7 +15,7 @@ from torchrl_pref.queries import QueryPool, load_safely, save_atomically
 KIND = "torchrl_pref checkpoint"
 FILE_NAME = "checkpoint.pt"
 
-FORMAT = 3
+FORMAT = 4
 """Raised whenever a key of the settings or of the checkpoint changes its meaning or its name."""
 
 

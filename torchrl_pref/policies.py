@@ -86,7 +86,7 @@ def scorer_policy(env: QueryEnv | FeedEnv, start: str | None = None) -> Policy:
         features = TensorDictModule(
             OfferFeatures(env),
             in_keys=["samples", "offer", "n_asked", "n_offered"],
-            out_keys=["offer_features", "rank", "share", "later"],
+            out_keys=["offer_features", "rank", "share", "urgency"],
         )
         network = OfferScorer(n_shares, device)
     logits = TensorDictModule(

@@ -37,7 +37,7 @@ QUERY_SCALE, FEED_SCALE = 8.0, 30.0
 """Logits per standard deviation of the greedy score, and per unit of rank, before training."""
 
 PATIENCE_SCALE = 20.0
-"""Patience per unit of its parameter: it is one number, and may move further than a weight."""
+"""Patience per unit of its parameters: they are few, and may move further than a weight."""
 
 
 class CandidateFeatures(nn.Module):
@@ -124,24 +124,26 @@ class OfferScorer(nn.Module):
     """The logits of skip and ask for one offer, started at a budget-aware quantile rule.
 
     That rule asks if the offer ranks among the best share of a reference sample of the pool, the
-    share being asks left over offers left. Here the rank is by information and expected alignment
-    together, and the share grows with the *patience*-th power of how much later the asks to come
-    are than the next one: an early question is easily good enough, a late one worth waiting for.
-    The patience is learned; it and a correction of the logits are zero at the start.
+    share being asks left over offers left. Here the share is multiplied by exp(*patience* ·
+    urgency), two numbers each, for the asks to come and for how unsure the belief is. With a
+    positive patience an early question, or one to an unsure belief, is easily good enough; a belief
+    that expects a misalignment below 1/e waits for better ones than the rule does. The patience is
+    learned; it and a correction of the logits are zero at the start.
     """
 
     def __init__(self, n_remaining: int, device: torch.device) -> None:
         super().__init__()
         self.log_scale = nn.Parameter(torch.tensor(math.log(FEED_SCALE), device=device))
-        self.patience = nn.Parameter(torch.zeros((), device=device))
+        self.patience = nn.Parameter(torch.zeros(2, device=device))
         self.network = _zero_headed_mlp(N_CANDIDATE + 1 + 1 + N_BELIEF + n_remaining, device)
 
     def forward(
-        self, offer: Tensor, rank: Tensor, share: Tensor, later: Tensor, belief: Tensor
+        self, offer: Tensor, rank: Tensor, share: Tensor, urgency: Tensor, belief: Tensor
     ) -> Tensor:
-        """From offer features (B F), its rank (B 1), the share of the best that is asked (B 1), how
-        much later the asks to come are (B 1) and belief features (B G) to logits (B 2)."""
-        eager = (share * (PATIENCE_SCALE * self.patience * later).exp()).clamp(max=1)
+        """From offer features (B F), its rank (B 1), the share of the best that the rule asks
+        (B 1), urgency (B 2) and belief features (B G) to logits (B 2)."""
+        patience = PATIENCE_SCALE * self.patience
+        eager = (share * (urgency @ patience).exp().unsqueeze(-1)).clamp(max=1)
         # At a share of 1 all that are left are asked, for certain.
         margin = rank - (1 - eager) + (share >= 1)
         correction = self.network(torch.cat([offer, rank, share, belief], -1))
@@ -153,6 +155,9 @@ class OfferScorer(nn.Module):
 class OfferFeatures(nn.Module):
     """The features of the one offered query, and its rank among a reference sample of the pool.
 
+    The rank is by information gain at the first ask, and all but 1/H by expected alignment gain at
+    the last.
+
     Args:
         env: gives the response model, the pool and the budgets.
     """
@@ -161,18 +166,24 @@ class OfferFeatures(nn.Module):
         super().__init__()
         self.features = CandidateFeatures(env.belief.response_model)
         self.budget, self.n_offers = env.budget, env.n_offers
-        self.rank = OfferRank(env, information_gain, alignment_gain)
+        self.rank = OfferRank(env, information_gain, late=alignment_gain)
 
     def forward(
         self, samples: Tensor, offer: Tensor, n_asked: Tensor, n_offered: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """From samples (B M D), offer (B K D) and counts (B 1) to offer features (B F), the rank in
-        information and alignment gain (B 1), asks left over offers left (B 1), and the log of the
-        mean number of the asks left over that of the next (B 1)."""
-        rank = self.rank(samples, offer)
+        """From samples (B M D), offer (B K D) and counts (B 1) to offer features (B F), the rank
+        (B 1), asks left over offers left (B 1), and urgency (B 2): the log of the mean number of
+        the asks left over that of the next, and one plus the log of the misalignment 1 - ‖E[ω]‖²
+        that the belief expects."""
+        rank = self.rank(samples, offer, 1 - n_asked / self.budget)
         share = asks_over_offers(n_asked, n_offered, self.budget, self.n_offers)
-        later = (0.5 + 0.5 * self.budget / (n_asked + 1)).clamp(min=1).log()
-        return self.features(samples, offer.unsqueeze(1)).squeeze(1), rank, share, later
+        later = (0.5 + 0.5 * self.budget / (n_asked + 1)).clamp(min=1)
+        misaligned = 1 - samples.mean(1).square().sum(-1, keepdim=True)
+        # Plus one: a log that is never above 0 could only lower the share, not raise it. The floor
+        # bounds what a belief that is all but certain can ask of the patience.
+        unsure = misaligned.clamp(min=1e-3).log() + 1
+        urgency = torch.cat([later.log(), unsure], -1)
+        return self.features(samples, offer.unsqueeze(1)).squeeze(1), rank, share, urgency
 
 
 def _zero_headed_mlp(n_inputs: int, device: torch.device) -> MLP:

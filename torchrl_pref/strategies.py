@@ -186,22 +186,27 @@ class QuantileAsk(TensorDictModuleBase):
 
     Args:
         env: gives the response model, the pool and the budgets.
-        acquisitions: the value of an offer, information gain by default; several functions are
-            standardised and averaged.
+        acquisition: the value of an offer; information gain by default.
+        late: what takes its place, a share 1/H more with each ask; None: nothing does.
     """
 
     in_keys = ["samples", "offer", "n_asked", "n_offered"]
     out_keys = ["action"]
 
-    def __init__(self, env: FeedEnv, *acquisitions: Acquisition) -> None:
+    def __init__(
+        self,
+        env: FeedEnv,
+        acquisition: Acquisition = information_gain,
+        late: Acquisition | None = None,
+    ) -> None:
         super().__init__()
-        self.rank = OfferRank(env, *acquisitions or (information_gain,))
+        self.rank = OfferRank(env, acquisition, late)
         self.budget, self.n_offers = env.budget, env.n_offers
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` (B)."""
         samples, offer, n_asked, n_offered = (tensordict[key] for key in self.in_keys)
-        rank = self.rank(samples, offer)
+        rank = self.rank(samples, offer, 1 - n_asked / self.budget)
         share = asks_over_offers(n_asked, n_offered, self.budget, self.n_offers)
         return tensordict.set("action", (rank >= 1 - share).squeeze(-1).long())
 
@@ -209,37 +214,45 @@ class QuantileAsk(TensorDictModuleBase):
 class OfferRank:
     """Where an offered query ranks in a sample of what the environment may offer.
 
-    Several acquisition functions are each standardised over the sample, and averaged. The sample's
-    scores are kept for as long as a session's belief stays the same, as it does with each skip.
+    With two acquisition functions, each is standardised over the sample; the first is weighted by
+    the share of asks left (1 at the first ask, 1/H at the last), the other by the rest. The
+    sample's scores are kept for as long as a session's belief stays the same, as it does with each
+    skip.
 
     Args:
         env: gives the response model and the pool; the sample is spread evenly over it.
-        acquisitions: what makes the score, at least one.
+        acquisition: what makes the score.
+        late: what takes its place, a share 1/H more with each ask; None: nothing does.
     """
 
-    def __init__(self, env: FeedEnv, *acquisitions: Acquisition) -> None:
+    def __init__(
+        self, env: FeedEnv, acquisition: Acquisition, late: Acquisition | None = None
+    ) -> None:
         self.response_model = env.belief.response_model
-        self.acquisition, self.n_scores = together(*acquisitions), len(acquisitions)
+        both = (acquisition,) if late is None else (acquisition, late)
+        self.acquisition, self.n_scores = together(*both), len(both)
         places = torch.linspace(0, len(env.features) - 1, min(REFERENCE, len(env.features)))
         self.reference = env.features[places.long().to(env.features.device)]
         self._samples, self._scores = torch.empty(0), torch.empty(0)
 
-    def __call__(self, samples: Tensor, offer: Tensor) -> Tensor:
+    def __call__(self, samples: Tensor, offer: Tensor, left: Tensor) -> Tensor:
         """The share of the sample that the offer scores above, and half a step beyond, so that no
         rounding decides whether it reaches another share.
 
         Args:
             samples: (B M D), the belief.
             offer: (B K D), the offered query.
+            left: (B 1), the share of the asks that is left.
 
         Returns:
             (B 1), from 1/2N to 1 + 1/2N for a sample of N.
         """
         scores = self._score_reference(samples)
         score = self._score(samples, offer.unsqueeze(1))
-        value = standardise(score, scores).mean(-1)
+        weights = torch.stack([left, 1 - left], -1) if self.n_scores == 2 else left.new_ones(1)
+        value = (weights * standardise(score, scores)).sum(-1)
         # A thousandth of a standard deviation keeps a query from outranking itself by rounding.
-        above = value > standardise(scores).mean(-1) + 1e-3
+        above = value > (weights * standardise(scores)).sum(-1) + 1e-3
         return (above.sum(1, keepdim=True) + 0.5) / len(self.reference)
 
     def _score_reference(self, samples: Tensor) -> Tensor:

@@ -148,7 +148,7 @@ def figure_1(panels: Mapping[str, Results], path: Path) -> None:
 
 def _draw_curve(axis: Axes, name: str, values: Tensor) -> None:
     """Mean over humans and its 95% interval."""
-    color, line = STYLE.get(name, (None, "-"))
+    color, line = STYLE.get(name.removesuffix(" (pretrained)"), (None, "-"))
     means = values.mean(0)
     intervals = torch.tensor([bootstrap_interval(column) for column in values.unbind(1)])
     # Dots go on top: a feed policy that asks everything lies exactly under "ask all".

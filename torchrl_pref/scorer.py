@@ -125,10 +125,9 @@ class OfferScorer(nn.Module):
 
     That rule asks if the offer ranks among the best share of a reference sample of the pool, the
     share being asks left over offers left. Here the share is multiplied by exp(*patience* ·
-    urgency), two numbers each, for the asks to come and for how unsure the belief is. With a
-    positive patience an early question, or one to an unsure belief, is easily good enough; a belief
-    that expects a misalignment below 1/e waits for better ones than the rule does. The patience is
-    learned; it and a correction of the logits are zero at the start.
+    urgency), two numbers each. The first makes the share larger the more asks are to come, the
+    second the less sure the belief is (and smaller once the misalignment it expects is below 1/e).
+    The patience is learned; it and a correction of the logits are zero at the start.
     """
 
     def __init__(self, n_remaining: int, device: torch.device) -> None:

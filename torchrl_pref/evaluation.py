@@ -12,11 +12,14 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Generator, Tensor
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from torchrl_pref.envs import FeedEnv, QueryEnv
 
 CURVES = ("alignment", "alignment_of_mean", "information", "ess")
+
+KEPT = ("n_asked", "n_offered", "metrics", "history")
+"""What an evaluation reads of each step."""
 
 
 @dataclass(frozen=True)
@@ -70,17 +73,14 @@ def evaluate(
     session = env.reset(humans.clone(), set_state=True)
     before = {name: session["metrics", name].cpu() for name in CURVES}
     start = time.perf_counter()
+    steps: list[TensorDictBase] = []
     with torch.no_grad(), set_exploration_type(mode):
-        steps_taken = env.rollout(
-            env.max_steps,
-            strategy,
-            auto_reset=False,
-            tensordict=session,
-            break_when_all_done=True,
-            return_contiguous=False,
-        )["next"]
-    steps_taken = steps_taken.select("n_asked", "n_offered", "metrics", "history", strict=False)
-    steps_taken = steps_taken.to("cpu")
+        # Not a rollout: that would keep what is on the table, a copy of the pool for each session.
+        while len(steps) < env.max_steps and not session["done"].all():
+            session = env.step(strategy(session))
+            steps.append(session["next"].select(*KEPT, strict=False))
+            session = step_mdp(session)
+    steps_taken = TensorDict.stack(steps, 1).to("cpu")
     seconds = time.perf_counter() - start
     n_asked = steps_taken["n_asked"].squeeze(-1)
     curves = {

@@ -137,14 +137,14 @@ def test_strategies_side_by_side_meet_the_same_offers_and_humans() -> None:
         return heldout.make_feed_env(settings, task, pool, sessions, 5)
 
     humans = draw_humans(make_env(7))
-    found = run_side_by_side(make_env, humans, {"one": RandomAsk(), "two": RandomAsk()})
-    one, two = found["one"], found["two"]
+    twice = [("rule", RandomAsk()), ("rule", RandomAsk())]
+    one, two = run_side_by_side(make_env, humans, twice)["rule"]
     # The first question is asked of the same belief, so it is worth the same.
     assert torch.allclose(one.information[:, 1], two.information[:, 1], atol=1e-6)
     assert torch.equal(one.alignment[:, 0], two.alignment[:, 0])
     other = draw_humans(make_env(7))
     other["offers"] = humans["offers"].flip(1)
-    third = run_side_by_side(make_env, other, {"three": RandomAsk()})["three"]
+    (third,) = run_side_by_side(make_env, other, [("rule", RandomAsk())])["rule"]
     assert not torch.allclose(one.information[:, 1], third.information[:, 1], atol=1e-3)
 
 

@@ -251,23 +251,26 @@ class Chorus(TensorDictModuleBase):
 MakeEnv = Callable[[int], QueryEnv | FeedEnv]
 """From a number of sessions to an environment for as many."""
 
+LineUp = Sequence[tuple[str, TensorDictModuleBase]]
+"""Strategies by name; a name that comes again is another run, or another training seed."""
+
 
 def run_side_by_side(
-    make_env: MakeEnv, humans: TensorDictBase, strategies: Mapping[str, TensorDictModuleBase]
-) -> dict[str, Evaluation]:
-    """Every strategy with the same humans (B), in one batch.
+    make_env: MakeEnv, humans: TensorDictBase, lineup: LineUp
+) -> dict[str, list[Evaluation]]:
+    """Every strategy with the same humans (B), in one batch; a list holds the runs of a name.
 
     ``seconds_per_query`` is the time to choose alone: the belief is updated for all together.
     """
-    count, chorus = len(humans), Chorus(list(strategies.values()))
-    env = make_env(count * len(strategies))
-    whole = evaluate(env, chorus, torch.cat([humans] * len(strategies)))
-    results = {}
-    for number, name in enumerate(strategies):
+    count, chorus = len(humans), Chorus([strategy for _, strategy in lineup])
+    env = make_env(count * len(lineup))
+    whole = evaluate(env, chorus, torch.cat([humans] * len(lineup)))
+    results: dict[str, list[Evaluation]] = {}
+    for number, (name, _) in enumerate(lineup):
         rows = slice(number * count, (number + 1) * count)
         own = {key: value[rows] for key, value in vars(whole).items() if isinstance(value, Tensor)}
         seconds = chorus.seconds[number] / max(1, int(own["asked"].sum()))
-        results[name] = replace(whole, **own, seconds_per_query=seconds)
+        results.setdefault(name, []).append(replace(whole, **own, seconds_per_query=seconds))
     return results
 
 
@@ -289,23 +292,19 @@ def _run_pool(job: Job) -> dict[str, list[Evaluation]]:
         again = _baselines(job, task, env, seed).items()
         lineup += [(name, strategy) for name, strategy in again if name.startswith(RIVALS)]
     lineup += [("RL", load_policy(one, env).strategy) for one in job.learned]
-    numbered = {str(number): strategy for number, (_, strategy) in enumerate(lineup)}
-    results: dict[str, list[Evaluation]] = {}
-    found = run_side_by_side(make_env, humans, numbered)
-    for (name, _), result in zip(lineup, found.values(), strict=True):
-        results.setdefault(name, []).append(result)
+    results = run_side_by_side(make_env, humans, lineup)
     learned = results.pop("RL")  # their row is the last
     if job.cell.setup == "query" and job.cell.features == "corners":
-        greedy = {"greedy information, no repeats": Greedy(task.response_model)}
+        greedy = Greedy(task.response_model)
         setup = {**job.settings["setup"], "repeats": False}
         unrepeated = partial(make_env, settings={**job.settings, "setup": setup})
-        extra = run_side_by_side(unrepeated, humans, greedy)
-        name = f"greedy information, M={FINE_SAMPLES} ({FINE_HUMANS} humans a pool)"
-        greedy = {name: Greedy(task.response_model)}
+        name = "greedy information, no repeats"
+        results |= run_side_by_side(unrepeated, humans, [(name, greedy)])
         belief = {**job.settings["belief"], "samples": FINE_SAMPLES}
         fine = partial(make_env, settings={**job.settings, "belief": belief})
-        extra |= run_side_by_side(fine, humans[:FINE_HUMANS].select("human"), greedy)
-        results |= {name: [result] for name, result in extra.items()}
+        name = f"greedy information, M={FINE_SAMPLES} ({FINE_HUMANS} humans a pool)"
+        few = humans[:FINE_HUMANS].select("human")
+        results |= run_side_by_side(fine, few, [(name, greedy)])
     return results | {"RL": learned}
 
 
@@ -343,9 +342,9 @@ def _fit_threshold(job: Job) -> Tensor:
         return make_feed_env(job.settings, task, task.train, sessions, 0)
 
     env = make_env(FIT_HUMANS)
-    rules = {f"{bits:g}": ThresholdAsk(env, bits) for bits in job.thresholds}
+    rules = [(f"{bits:g}", ThresholdAsk(env, bits)) for bits in job.thresholds]
     results = run_side_by_side(make_env, draw_humans(env), rules)
-    return torch.stack([result.alignment[:, -1].mean() for result in results.values()])
+    return torch.stack([result.alignment[:, -1].mean() for (result,) in results.values()])
 
 
 def _gather(pools: Sequence[Mapping[str, Sequence[Evaluation]]]) -> dict[str, Outcome]:

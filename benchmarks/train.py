@@ -113,7 +113,7 @@ def twin_arguments() -> tuple[Any, ...]:
     """What a twin is made with; all share one pool."""
     belief = Belief(Boltzmann(common.TAU))
     pool = common.normalised_pool().features.double().numpy()
-    return pool, common.TAU, belief.n_samples, belief.n_moves, BUDGET
+    return pool, common.TAU, belief.n_samples, 4, BUDGET
 
 
 def make_twin() -> Any:

@@ -10,8 +10,10 @@ PACKAGE = Path(torchrl_pref.__file__).parent
 LAYERS = [
     {"errors", "compiled"},
     {"responses", "sampler_cpu"},
-    {"acquisition", "sampler"},
-    {"belief", "features", "gridworld"},
+    {"acquisition", "resampling_cpu"},
+    {"resampling"},
+    {"sampler", "features"},
+    {"belief", "gridworld"},
     {"queries", "humans", "objectives"},
     {"envs"},
     {"strategies"},

@@ -5,17 +5,8 @@ import torch
 from conftest import RESPONSE_MODELS
 from torch import Generator, Tensor
 
-from torchrl_pref.belief import (
-    Belief,
-    feature_gaps,
-    kish_share,
-    orthonormal,
-    systematic_resample,
-    uniform_sphere,
-)
+from torchrl_pref.belief import Belief, feature_gaps, uniform_sphere
 from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel
-from torchrl_pref.sampler import ARC, MAX_SHRINKS, compiled_constants, tensor_step
-from torchrl_pref.sampler_cpu import compiled_step
 
 
 class Unknown(ResponseModel):
@@ -91,15 +82,18 @@ def test_moments_agree_with_quadrature(
 
 
 @pytest.mark.parametrize("model", RESPONSE_MODELS, ids=str)
-def test_effective_sample_size_is_what_it_says(model: ResponseModel, generator: Generator) -> None:
+def test_effective_sample_size_is_what_it_says(
+    model: ResponseModel, generator: Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Var(ω) / ESS is the variance of the mean over independent runs of the same answers."""
+    monkeypatch.setattr("torchrl_pref.belief.MAX_ROUNDS", 1)
     queries = torch.randn(3, 2, 4, generator=generator)
     omega = uniform_sphere((4,), generator)
     answers = (queries @ omega).argmax(-1)
     samples, ess = converse(Belief(model, moves=1), queries, answers, 400, generator)
     true = samples.flatten(0, 1).var(0).sum() / samples.mean(1).var(0).sum()
     assert float(true) < 70  # one move leaves copies close together: there is something to report
-    assert float(ess.mean()) == pytest.approx(float(true), rel=0.25)
+    assert float(ess.mean()) == pytest.approx(float(true), rel=0.15)
     assert ((ess >= 1) & (ess <= 100)).all()
 
 
@@ -202,52 +196,6 @@ def test_identical_options_teach_nothing(belief: Belief, generator: Generator) -
     assert (ess > 90).all()
 
 
-@pytest.mark.parametrize("spread", [0.2, 0.02])
-@pytest.mark.parametrize(("n_options", "n_features"), [(2, 4), (4, 4), (2, 2)])
-@pytest.mark.parametrize("model", [*RESPONSE_MODELS, Boltzmann(300.0)], ids=str)
-def test_compiled_step_moves_samples_where_the_tensor_step_does(
-    model: ResponseModel, n_options: int, n_features: int, spread: float, generator: Generator
-) -> None:
-    sessions = 20
-    belief = Belief(model)
-    samples, ess = belief.prior(sessions, n_features, generator), torch.full((sessions,), 100.0)
-    omega = uniform_sphere((sessions, n_features, 1), generator)
-    gaps = torch.zeros(sessions, 9, n_options - 1, n_features)
-    for h in range(9):
-        queries = torch.randn(sessions, n_options, n_features, generator=generator)
-        answers = model((queries @ omega).squeeze(-1)).exp().multinomial(1, generator=generator)
-        newest = feature_gaps(queries, answers.squeeze(-1))
-        samples, ess, _ = belief.update(samples, ess, gaps, newest, generator)
-        gaps[:, h] = newest  # until then a row of zeros
-    poles = torch.randn(samples.shape, generator=generator) * spread
-    uniform = torch.rand((*samples.shape[:2], 2 + MAX_SHRINKS), generator=generator)
-    for slack in (torch.zeros(sessions), torch.rand(sessions, generator=generator)):
-        given = samples, poles, gaps, slack, uniform
-        constants = compiled_constants(model)
-        assert constants is not None
-        compiled = compiled_step(*given, ARC, *constants)
-        close = (compiled - tensor_step(*given, model)).norm(dim=-1) < 1e-3
-        # A proposal at the very edge of its slice may be judged differently.
-        assert close.float().mean() > 0.995
-        assert ((compiled - samples).norm(dim=-1) > 1e-3).float().mean() > 0.9
-
-
-@pytest.mark.parametrize("model", RESPONSE_MODELS, ids=str)
-def test_tensor_step_stays_on_its_device(model: ResponseModel) -> None:
-    """``meta`` stands for a GPU: nothing is computed, but devices must not be mixed."""
-    shapes = (5, 30, 4), (5, 30, 4), (5, 7, 1, 4), (5,), (5, 30, 2 + MAX_SHRINKS)
-    moved = tensor_step(*(torch.empty(shape, device="meta") for shape in shapes), model)
-    assert moved.device.type == "meta"
-    assert moved.shape == shapes[0]
-
-
-@pytest.mark.parametrize("n", [3, 4, 7])
-def test_directions_come_in_orthonormal_frames(n: int, generator: Generator) -> None:
-    vectors = orthonormal(n, torch.Size((5, 6, 3)), generator).movedim(0, -2)
-    for frame in vectors.split(3, -2):
-        assert torch.allclose(frame @ frame.mT, torch.eye(frame.shape[-2]), atol=1e-3)
-
-
 def test_permuting_options_permutes_the_answer(generator: Generator) -> None:
     queries = torch.randn(20, 4, 3, generator=generator)
     answers = torch.randint(4, (20,), generator=generator)
@@ -258,20 +206,12 @@ def test_permuting_options_permutes_the_answer(generator: Generator) -> None:
     assert (feature_gaps(queries, torch.full((20,), -1)) == 0).all()
 
 
-def test_resampling_follows_the_weights(generator: Generator) -> None:
-    log_weights = torch.tensor([[0.0, math.log(2), -math.inf, 0.0]]).expand(2000, 4)
-    counts = systematic_resample(log_weights, generator).flatten().bincount(minlength=4) / 2000
-    assert counts.tolist() == pytest.approx([1, 2, 0, 1], abs=0.05)
-    assert float(kish_share(log_weights[0])) == pytest.approx(16 / (4 * 6))
-    assert float(kish_share(torch.full((4,), -math.inf))) == 0
-
-
 @pytest.mark.parametrize("model", RESPONSE_MODELS, ids=str)
 def test_large_batches_lose_no_answer(
     model: ResponseModel, generator: Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Sessions are moved some at a time, with answers of their own number."""
-    monkeypatch.setattr("torchrl_pref.belief.MOVED", 40 * 10)
+    monkeypatch.setattr("torchrl_pref.belief.MOVED", 40 * 4 * 10)
     sessions = 37
     belief = Belief(model, samples=40)
     normals = torch.eye(3)

@@ -9,11 +9,11 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_pref.acquisition import alignment_gain, information_gain
 from torchrl_pref.attention import TOKENS, belief_tokens
-from torchrl_pref.belief import covariance_of
 from torchrl_pref.envs import FeedEnv, QueryEnv
 from torchrl_pref.objectives import make_objective
 from torchrl_pref.policies import Policy, attention_policy, paper_policy, scorer_policy
 from torchrl_pref.queries import QueryPool
+from torchrl_pref.resampling import covariance_of
 from torchrl_pref.responses import ResponseModel
 from torchrl_pref.strategies import QuantileAsk, RandomAsk, RandomQuery
 

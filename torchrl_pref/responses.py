@@ -56,6 +56,17 @@ class ResponseModel(ABC):
         """
         return self.log_likelihood(gaps).sum(-1)
 
+    def agrees(self, gaps: Tensor) -> Tensor:
+        """Whether the choice of an option is possible, other than as a tie of options that differ.
+
+        Args:
+            gaps: (… K-1), as in :meth:`log_likelihood`.
+
+        Returns:
+            (…) bool.
+        """
+        return self.log_likelihood(gaps) > -math.inf
+
     def __call__(self, returns: Tensor) -> Tensor:
         """Log-probability of each answer.
 
@@ -167,6 +178,10 @@ class Optimal(ResponseModel):
         ties = 1 + (gaps.abs() <= self.tolerance).sum(-1)
         beaten = (gaps < -self.tolerance).any(-1)
         return torch.where(beaten, -math.inf, -ties.to(gaps.dtype).log())
+
+    def agrees(self, gaps: Tensor) -> Tensor:
+        """See :meth:`ResponseModel.agrees`: two that differ are never quite equal."""
+        return (gaps > self.tolerance).all(-1)
 
     def predict(self, leads: Tensor) -> Prediction:
         """See :meth:`ResponseModel.predict`."""

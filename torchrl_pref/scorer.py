@@ -20,10 +20,10 @@ from torchrl_pref.acquisition import (
     together,
     volume_removal,
 )
-from torchrl_pref.belief import covariance_of
 from torchrl_pref.envs import FeedEnv
 from torchrl_pref.errors import check_choice
 from torchrl_pref.objectives import OBJECTIVES
+from torchrl_pref.resampling import covariance_of
 from torchrl_pref.responses import ResponseModel
 from torchrl_pref.strategies import OfferRank, asks_over_offers
 

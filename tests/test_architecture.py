@@ -8,7 +8,7 @@ import torchrl_pref
 PACKAGE = Path(torchrl_pref.__file__).parent
 
 LAYERS = [
-    {"errors"},
+    {"errors", "compiled"},
     {"responses", "sampler_cpu"},
     {"acquisition", "sampler"},
     {"belief", "features", "gridworld"},

@@ -2,8 +2,7 @@
 
 A sample that has found its place costs nothing more, a session's numbers never leave the cache, and
 a call for one session costs a hundredth of one for a hundred. Innermost loops run over samples, so
-that the processor takes several at once. The compiled code is kept in ``__pycache__`` (or in
-``NUMBA_CACHE_DIR``); the first call on a new machine takes some seconds.
+that the processor takes several at once. The first call on a new machine takes some seconds.
 
 Shapes: S sessions, M samples, H answers, K options per query, D features, U uniforms of a step,
 G = h (K-1) return gaps of the h answers that a session has.
@@ -16,13 +15,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
-Array = np.ndarray[Any, np.dtype[Any]]
+from torchrl_pref.compiled import compiled
 
-# Sums may be reordered; infinities keep their meaning.
-compiled = njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
+Array = np.ndarray[Any, np.dtype[Any]]
 
 
 def compiled_step(

@@ -16,7 +16,7 @@ import hydra
 from omegaconf import DictConfig
 
 import app
-from torchrl_pref import comparison, experiment, heldout, heldout_report, reports
+from torchrl_pref import comparison, experiment, heldout, heldout_report, reports, runs
 from torchrl_pref.checkpoint import FILE_NAME, Checkpoint
 from torchrl_pref.errors import InputError, check_choice, check_count, one_line_errors
 from torchrl_pref.pretrained import SEEDS, pretrained_checkpoint
@@ -47,38 +47,47 @@ def job(config: DictConfig) -> None:
     """Evaluate checkpoints, or the baselines where none is named."""
     folder = app.output_folder()
     try:
-        with one_line_errors():
-            settings = app.plain_settings(config)
-            app.use_threads(settings)
-            named = settings["checkpoint"]
-            check_lists(settings)
-            if app.was_typed("objective"):
+        with one_line_errors(), runs.claimed(folder):
+            if (folder / FILE_NAME).exists() or (folder / "config.yaml").exists():
                 raise InputError(
-                    "objective=… is what a policy is trained for and changes nothing here; "
-                    "expected by train.py alone; remove it"
+                    f"{folder} holds a run, whose tables and figures would be overwritten; name "
+                    "another folder by hydra.run.dir="
                 )
-            if settings["protocol"] is not None:
-                check_choice("protocol", settings["protocol"], ("heldout",))
-                app.refuse_other_overrides("protocol", PROTOCOL_KEYS)
-                run_heldout(settings, folder)
-            elif "policy" in settings:
-                check_choice("policy", settings["policy"]["name"], ("pretrained",))
-                if named is not None:
-                    raise InputError(
-                        "policy=pretrained and checkpoint=… name two policies; expected one of "
-                        "them; pretrained policies are files too: checkpoint=[a.pt,b.pt]"
-                    )
-                panels = evaluate_taus(settings, partial(pretrained_for, settings))
-                reports.write_report(folder, panels, {})
-            elif named is None:
-                reports.write_report(folder, evaluate_taus(settings, lambda tau: {}), {})
-            else:
-                allowed = ("evaluation.", "pool.test", "device", "threads", "hydra.")
-                app.refuse_other_overrides("checkpoint", allowed)
-                paths = find_checkpoints([str(name) for name in listed(named)])
-                reports.write_report(folder, *evaluate_checkpoints(settings, paths))
+            evaluate(app.plain_settings(config), folder)
     finally:
         app.discard_if_empty(folder)
+
+
+def evaluate(settings: dict[str, Any], folder: Path) -> None:
+    """What the settings ask for, reported in a folder."""
+    app.use_threads(settings)
+    named = settings["checkpoint"]
+    check_lists(settings)
+    if app.was_typed("objective"):
+        raise InputError(
+            "objective=… is what a policy is trained for and changes nothing here; "
+            "expected by train.py alone; remove it"
+        )
+    if settings["protocol"] is not None:
+        check_choice("protocol", settings["protocol"], ("heldout",))
+        app.refuse_other_overrides("protocol", PROTOCOL_KEYS)
+        run_heldout(settings, folder)
+    elif "policy" in settings:
+        check_choice("policy", settings["policy"]["name"], ("pretrained",))
+        if named is not None:
+            raise InputError(
+                "policy=pretrained and checkpoint=… name two policies; expected one of "
+                "them; pretrained policies are files too: checkpoint=[a.pt,b.pt]"
+            )
+        panels = evaluate_taus(settings, partial(pretrained_for, settings))
+        reports.write_report(folder, panels, {})
+    elif named is None:
+        reports.write_report(folder, evaluate_taus(settings, lambda tau: {}), {})
+    else:
+        allowed = ("evaluation.", "pool.test", "device", "threads", "hydra.")
+        app.refuse_other_overrides("checkpoint", allowed)
+        paths = find_checkpoints([str(name) for name in listed(named)])
+        reports.write_report(folder, *evaluate_checkpoints(settings, paths))
 
 
 def check_lists(settings: dict[str, Any]) -> None:

@@ -8,8 +8,8 @@ import torchrl_pref
 PACKAGE = Path(torchrl_pref.__file__).parent
 
 LAYERS = [
-    {"errors", "compiled"},
-    {"responses", "sampler_cpu"},
+    {"errors", "compiled", "writing"},
+    {"responses", "runs", "sampler_cpu"},
     {"acquisition", "sampler"},
     {"belief", "features", "gridworld"},
     {"queries", "humans", "objectives"},
@@ -21,7 +21,7 @@ LAYERS = [
     {"experiment"},
     {"comparison", "pretrained"},
     {"heldout", "reports"},
-    {"heldout_report"},
+    {"heldout_report", "sweeps"},
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 

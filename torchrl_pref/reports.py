@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
@@ -16,6 +15,7 @@ from tabulate import tabulate
 from torch import Tensor
 
 from torchrl_pref.evaluation import CURVES, Evaluation, bootstrap_interval
+from torchrl_pref.writing import replacing, write_text
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -109,7 +109,7 @@ def signed(mean: float, interval: tuple[float, float]) -> str:
 
 def write_curves(panels: Mapping[str, Results], path: Path) -> None:
     """Write every curve as CSV: panel, strategy, queries asked, metric, mean and 95% interval."""
-    with path.open("w", newline="") as file:
+    with replacing(path) as partial, partial.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["panel", "strategy", "queries", "metric", "mean", "low", "high"])
         for panel, results in panels.items():
@@ -195,7 +195,7 @@ def write_report(
     panels: Mapping[str, Results],
     histories: Mapping[str, Mapping[str, Sequence[float]]],
 ) -> None:
-    """Print the tables of each panel; write tables, curves and figures to a folder and say where.
+    """Write tables, curves and figures to a folder; print the tables of each panel and say where.
 
     Args:
         folder: an existing folder.
@@ -209,8 +209,7 @@ def write_report(
         tables += [heading, "", alignment_table(results), ""]
         tables += ["after the last query", "", detail_table(results), ""]
     text = "\n".join(tables)
-    print("\n" + text)
-    (folder / "tables.txt").write_text(text)
+    write_text(folder / "tables.txt", text)
     write_curves(panels, folder / "curves.csv")
     figure_1(panels, folder / "figure_1.png")
     written = ["tables.txt", "curves.csv", "figure_1.png"]
@@ -225,34 +224,7 @@ def write_report(
     if len(histories) == 1:
         training_figure(next(iter(histories.values())), folder / "training.png")
         written.append("training.png")
-    print(f"written to {folder}: {', '.join(written)}")
-
-
-def write_summary(folder: Path, overrides: Sequence[str], result: Evaluation) -> None:
-    """Write what :func:`sweep_table` gathers: the keys typed and the policy's final numbers."""
-    numbers = {
-        f"alignment after {j}": round(float(result.alignment[:, j].mean()), 4)
-        for j in milestones(result.alignment.shape[1] - 1)
-    }
-    numbers["bits"] = round(float(result.information[:, -1].mean()), 3)
-    numbers["asked"] = round(float(result.asked.float().mean()), 2)
-    content = {"overrides": list(overrides), **numbers}
-    (folder / "summary.json").write_text(json.dumps(content, indent=1) + "\n")
-
-
-def sweep_table(folder: Path) -> str:
-    """One row for each finished job of a sweep; also written to the sweep's ``summary.csv``."""
-    rows = []
-    for path in sorted(folder.glob("*/summary.json"), key=lambda path: path.parent.name.zfill(9)):
-        content = json.loads(path.read_text())
-        keys = dict(override.split("=", 1) for override in content.pop("overrides"))
-        rows.append({"job": path.parent.name, **keys, **content})
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    with (folder / "summary.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, names, restval="")
-        writer.writeheader()
-        writer.writerows(rows)
-    return f"\nsweep so far, {folder / 'summary.csv'}\n" + tabulate(rows, headers="keys")
+    print(f"\n{text}\nwritten to {folder}: {', '.join(written)}")
 
 
 def smoothed(values: Sequence[float], edges: Sequence[int]) -> tuple[list[float], list[float]]:
@@ -282,5 +254,6 @@ def geometric_edges(count: int) -> list[int]:
 def save_figure(figure: Figure, path: Path) -> None:
     """Write a figure to a file and close it."""
     figure.tight_layout()
-    figure.savefig(path, dpi=150)
+    with replacing(path) as partial:
+        figure.savefig(partial, dpi=150)
     plt.close(figure)

@@ -29,6 +29,7 @@ from tqdm import tqdm
 from torchrl_pref.envs import FeedEnv, QueryEnv
 from torchrl_pref.errors import check_choice, check_count, check_positive, check_share
 from torchrl_pref.policies import Policy
+from torchrl_pref.writing import write_text
 
 LOGGERS = ("csv", "tensorboard")
 
@@ -163,15 +164,16 @@ class Trainer:
             auto_register_policy_transforms=False,
         )
 
-    def run(self, folder: Path, save: Callable[[], None]) -> bool:
-        """Train until the last update, or until Ctrl-C.
+    def run(self, folder: Path, save: Callable[[], None]) -> None:
+        """Train until the last update. Ctrl-C and SIGTERM take effect once the update that they
+        came in is done and saved.
 
         Args:
             folder: where the logs go.
-            save: called every ``save_every`` updates, at the end and at Ctrl-C.
+            save: called every ``save_every`` updates, at the end and before a stop.
 
-        Returns:
-            Whether training ran to its end.
+        Raises:
+            KeyboardInterrupt: at Ctrl-C; at SIGTERM whatever the process does then.
         """
         settings, progress = self.settings, self.progress
         loggers = [_open_logger(kind, folder, progress.update) for kind in LOGGERS]
@@ -196,7 +198,6 @@ class Trainer:
                 if progress.update % settings.save_every == 0:
                     save()
             save()
-        return progress.update >= settings.updates
 
     def update(self, batch: TensorDictBase) -> None:
         """One A2C step on a batch (B T) of transitions, and the critic's own."""
@@ -286,7 +287,7 @@ def _open_logger(kind: str, folder: Path, update: int) -> Logger:
     """A TorchRL logger; CSV rows that a resumed run will write again are dropped first."""
     for path in (folder / "csv" / "scalars").rglob("*.csv") if kind == "csv" else ():
         rows = path.read_text().splitlines(keepends=True)
-        path.write_text("".join(row for row in rows if int(row.split(",")[0]) <= update))
+        write_text(path, "".join(row for row in rows if int(row.split(",")[0]) <= update))
     logger = get_logger(kind, logger_name=str(folder), experiment_name=kind)
     assert logger is not None
     return logger
@@ -294,16 +295,25 @@ def _open_logger(kind: str, folder: Path, update: int) -> Logger:
 
 @contextmanager
 def _stop_request() -> Iterator[Callable[[], bool]]:
-    """Turn the first Ctrl-C into a request to stop after the current update."""
-    requested = False
+    """Hold the first Ctrl-C or SIGTERM back until the end of the block; says whether it came."""
+    came: list[int] = []
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    # What a process ignores, as one in the background Ctrl-C, is not meant for it.
+    before = {n: handler for n, handler in before.items() if handler not in (signal.SIG_IGN, None)}
+
+    def restore() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
     def request(number: int, frame: FrameType | None) -> None:
-        nonlocal requested
-        requested = True
-        signal.signal(signal.SIGINT, before)
+        came.append(number)
+        restore()
 
-    before = signal.signal(signal.SIGINT, request)
+    for number in before:
+        signal.signal(number, request)
     try:
-        yield lambda: requested
+        yield lambda: bool(came)
     finally:
-        signal.signal(signal.SIGINT, before)
+        restore()
+    if came:
+        signal.raise_signal(came[0])

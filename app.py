@@ -169,7 +169,8 @@ def as_typed(key: str, folder: Path) -> str:
     """``key=folder`` as Hydra is to be told it."""
     text = str(folder)
     if not re.fullmatch(r"[\w./-]*/[\w./-]*", text, re.ASCII):
-        text = QuotedString(text, Quote.single).with_quotes()
+        text = re.sub(r"(\\*)\$\{", r"\1\1\\${", text)  # no interpolation
+        text = QuotedString(text, Quote.double).with_quotes()
     return f"{key}={text}"
 
 
@@ -186,7 +187,7 @@ class Sweep(Callback):
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Refuse to mix two sweeps; begin the table."""
-        folder = Path(str(config.hydra.sweep.dir)).absolute()
+        folder = Path(os.path.abspath(config.hydra.sweep.dir))
         with one_line_errors():
             folder.mkdir(parents=True, exist_ok=True)
             Sweep.claim.enter_context(runs.claimed(folder))
@@ -249,7 +250,7 @@ def do_job(work: Callable[[Path], float]) -> float:
     try:
         with unbroken_output(), one_line_errors():
             if in_sweep():
-                sweep = Path(HydraConfig.get().sweep.dir).absolute()
+                sweep = Path(os.path.abspath(HydraConfig.get().sweep.dir))
                 return sweeps.attempt(sweep, folder, typed_overrides(), lambda: work(folder))
             return work(folder)
     finally:

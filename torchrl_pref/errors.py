@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -85,6 +86,11 @@ def check_choice(name: str, value: Any, choices: tuple[str, ...]) -> str:
     return str(value)
 
 
+def one_line(error: Exception) -> str:
+    """What an error says, without its line breaks; other blanks may be of a path, and stay."""
+    return re.sub(r"\s*\n\s*", " ", str(error)).strip()
+
+
 @contextmanager
 def one_line_errors() -> Iterator[None]:
     """End the program with status 2 and one line on stderr where the input was at fault.
@@ -94,5 +100,5 @@ def one_line_errors() -> Iterator[None]:
     try:
         yield
     except (InputError, OSError) as error:
-        print("error: " + " ".join(str(error).split()), file=sys.stderr)
+        print(f"error: {one_line(error)}", file=sys.stderr)
         raise SystemExit(2) from None

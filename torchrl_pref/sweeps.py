@@ -18,7 +18,7 @@ from typing import Any
 
 from tabulate import tabulate
 
-from torchrl_pref.errors import InputError
+from torchrl_pref.errors import InputError, one_line
 from torchrl_pref.evaluation import Evaluation
 from torchrl_pref.reports import milestones
 from torchrl_pref.writing import replacing, write_text
@@ -68,7 +68,7 @@ def attempt(
         value = work()
         (folder / FAILED).unlink(missing_ok=True)
     except Exception as error:
-        reason = " ".join(str(error).split())
+        reason = one_line(error)
         if not isinstance(error, (InputError, OSError)):  # a defect of ours
             traceback.print_exc()
             reason = f"{type(error).__name__}: {reason}"

@@ -11,9 +11,9 @@ from torch import Tensor
 from torchrl_pref.errors import InputError
 from torchrl_pref.features import Normalizer
 from torchrl_pref.queries import QueryPool, load_safely, save_atomically
+from torchrl_pref.runs import CHECKPOINT
 
 KIND = "torchrl_pref checkpoint"
-FILE_NAME = "checkpoint.pt"
 
 FORMAT = 4
 """Raised whenever a key of the settings or of the checkpoint changes its meaning or its name."""
@@ -72,7 +72,7 @@ class Checkpoint:
             InputError: it is missing, cut off, or written by something else.
         """
         path = Path(path)
-        content = load_safely(path / FILE_NAME if path.is_dir() else path, KIND)
+        content = load_safely(path / CHECKPOINT if path.is_dir() else path, KIND)
         content.pop("kind")
         found = content.pop("format", None)
         if found != FORMAT or set(content) != set(cls.__dataclass_fields__):

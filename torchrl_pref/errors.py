@@ -9,6 +9,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+LONGEST = 1200
+"""Letters of an error that are shown."""
+
 
 class InputError(ValueError):
     """Input that cannot be used. The message is one line, written for the person who gave it."""
@@ -87,8 +90,11 @@ def check_choice(name: str, value: Any, choices: tuple[str, ...]) -> str:
 
 
 def one_line(error: Exception) -> str:
-    """What an error says, without its line breaks; other blanks may be of a path, and stay."""
-    return re.sub(r"\s*\n\s*", " ", str(error)).strip()
+    """What an error says, without line breaks, what a terminal would act upon, and the middle of
+    what is too long; other blanks may be of a path, and stay."""
+    text = re.sub(r"\s*\n\s*", " ", str(error)).strip()
+    text = re.sub(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]", "?", text)
+    return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} … {text[-LONGEST // 2 :]}"
 
 
 @contextmanager

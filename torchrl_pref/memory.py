@@ -1,9 +1,9 @@
 """About how much memory a run takes, so that one which cannot fit is refused before it starts.
 
-Letters as everywhere: B sessions, H budget, O offers, M samples, N queries, C candidates, K options,
-D features, T steps (in a pool: cells of a walk). The bytes of each term were measured, as the peak
-of a process with one of the sizes raised: they are right to about a half, which is enough to tell
-what fits from what does not.
+Letters as everywhere: B sessions, H budget, O offers, M samples, N queries, C candidates, K options
+per query, D features, T steps (of a pool: cells of a walk). The bytes of each term were measured,
+as the peak of a process with one of the sizes raised: they are right to about a half, which is
+enough to tell what fits from what does not.
 """
 
 from __future__ import annotations

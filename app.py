@@ -45,11 +45,10 @@ def main(job: Callable[[], Any], check: Callable[[dict[str, Any]], None]) -> Non
     path = [str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])]
     os.environ["PYTHONPATH"] = os.pathsep.join(path)
     signal.signal(signal.SIGTERM, _terminate)
-    typed.Gate.check = check
+    typed.Gate.check, typed.Gate.passed, typed.Gate.made = check, False, ()
     with unbroken_output(), one_line_errors():
         try:
-            typed.refuse_flags()
-            with typed.refusals(), sweep_report():
+            with typed.refusals(), typed.checked_flags(), sweep_report():
                 job()
         except KeyboardInterrupt as stop:
             print("\nstopped", file=sys.stderr)

@@ -68,15 +68,14 @@ def check(settings: dict[str, Any]) -> None:
     Raises:
         InputError: a setting is out of range, or was typed where something else decides.
     """
-    check_evaluate_settings(settings)
     if typed.was_typed("objective"):
         raise InputError(
             "objective=… is what a policy is trained for and changes nothing here; "
             "expected by train.py alone; remove it"
         )
-    if settings["protocol"] is not None:
+    if settings.get("protocol") is not None:
         typed.refuse_other_overrides("protocol", PROTOCOL_KEYS)
-    elif settings["checkpoint"] is not None:
+    elif settings.get("checkpoint") is not None:
         if "policy" in settings:
             raise InputError(
                 "policy=pretrained and checkpoint=… name two policies; expected one of "
@@ -84,6 +83,7 @@ def check(settings: dict[str, Any]) -> None:
             )
         allowed = ("evaluation.", "pool.test", "device", "threads", "hydra.")
         typed.refuse_other_overrides("checkpoint", allowed)
+    check_evaluate_settings(settings)
 
 
 def evaluate(settings: dict[str, Any], folder: Path) -> None:

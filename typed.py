@@ -8,6 +8,7 @@ import os
 import re
 import shlex
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NoReturn
@@ -59,6 +60,12 @@ class Gate(Callback):
                 f"hydra.job.chdir={config.hydra.job.chdir}: paths are meant as from the folder "
                 "that you are in; remove hydra.job.chdir"
             )
+        inside = config.hydra.output_subdir
+        if inside is not None and not re.fullmatch(r"[\w-][\w.-]{0,99}", inside):
+            raise InputError(
+                f"hydra.output_subdir={inside!r}: expected the name of a folder within that of the "
+                "run, such as hydra.output_subdir=hydra, or null"
+            )
 
 
 @contextlib.contextmanager
@@ -70,8 +77,6 @@ def refusals() -> Iterator[None]:
     """
     try:
         yield
-    except (InputError, OSError):
-        raise
     except (HydraException, OmegaConfBaseException) as error:
         text = re.sub(
             r"\.? (Config search path:|full_key:|To append to your config).*",
@@ -80,7 +85,7 @@ def refusals() -> Iterator[None]:
         )
         raise InputError(f"{text}; --help lists the keys and their values") from None
     except Exception as error:
-        if Gate.passed:
+        if Gate.passed or isinstance(error, (InputError, OSError)):
             raise
         raise InputError(
             f"{shlex.join(sys.argv[1:])}: cannot be read ({type(error).__name__}: {error}); --help "
@@ -88,18 +93,13 @@ def refusals() -> Iterator[None]:
         ) from None
 
 
-def refuse_flags() -> None:
+@contextlib.contextmanager
+def checked_flags() -> Iterator[None]:
     """Say in one line what is wrong with a flag; refuse those that go past the checks.
 
     Raises:
         InputError: one of those was typed.
     """
-
-    def error(self: argparse.ArgumentParser, message: str) -> NoReturn:
-        raise InputError(f"{message}; settings are typed as key=value, --help lists them")
-
-    # Hydra's own parser, which nobody else is handed, would print its usage as well.
-    argparse.ArgumentParser.error = error  # type: ignore[method-assign]
     for argument in sys.argv[1:]:
         if argument.startswith("--e"):  # also where it is abbreviated
             raise InputError(
@@ -112,6 +112,17 @@ def refuse_flags() -> None:
                 "into a file experiment/<name>.yaml, chosen by experiment=<name>, in conf or in "
                 "the folder named by --config-dir"
             )
+
+    def error(self: argparse.ArgumentParser, message: str) -> NoReturn:
+        raise InputError(f"{message}; settings are typed as key=value, --help lists them")
+
+    # Hydra's own parser, which nobody else is handed, would print its usage as well.
+    before = argparse.ArgumentParser.error
+    argparse.ArgumentParser.error = error  # type: ignore[method-assign]
+    try:
+        yield
+    finally:
+        argparse.ArgumentParser.error = before  # type: ignore[method-assign]
 
 
 def plain_settings(config: DictConfig) -> Settings:
@@ -178,10 +189,11 @@ def _check_folder(key: str, value: str) -> Path:
     if not value.isprintable() or any(len(os.fsencode(part)) > 255 for part in folder.parts):
         raise InputError(f"{key}={value!r}: no folder can have this name; choose another")
     nearest = next(path for path in (folder, *folder.parents) if path.exists())
-    if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
-        why = "is no folder" if not nearest.is_dir() else "may not be written by you"
+    try:
+        with tempfile.TemporaryFile(dir=nearest):
+            return folder
+    except OSError as error:
         raise InputError(
-            f"{key}={value}: the run folder cannot be written ({nearest} {why}); set {key} to a "
-            "folder that can be"
-        )
-    return folder
+            f"{key}={value}: the run folder cannot be written ({nearest}: {error.strerror}); set "
+            f"{key} to a folder that can be"
+        ) from None

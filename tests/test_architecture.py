@@ -9,8 +9,8 @@ PACKAGE = Path(torchrl_pref.__file__).parent
 
 LAYERS = [
     {"errors", "compiled", "writing"},
-    {"responses", "runs", "sampler_cpu"},
-    {"acquisition", "sampler"},
+    {"checks", "memory", "responses", "runs", "sampler_cpu"},
+    {"acquisition", "sampler", "settings"},
     {"belief", "features", "gridworld"},
     {"queries", "humans", "objectives"},
     {"envs"},

@@ -58,6 +58,8 @@ def main(job: Callable[[], Any], check: Callable[[dict[str, Any]], None]) -> Non
                 f"{error.filename}: the run folder cannot be written ({error.strerror}); "
                 "set hydra.run.dir to a folder that can be"
             ) from None
+        finally:
+            typed.discard_folders()
 
 
 def _terminate(number: int, frame: FrameType | None) -> None:
@@ -221,15 +223,14 @@ def output_folder() -> Path:
 
 
 def discard_if_empty(folder: Path) -> None:
-    """Remove the folders that Hydra made for a job that left them empty.
+    """Remove the default folder of a sweep's job that left it empty, and the dated ones around it.
 
-    A folder that was there before is the user's, and stays; of a sweep's only the default ones go.
+    A folder that the user named is theirs, and stays.
     """
-    made = typed.Gate.made
-    if in_sweep() and folder.is_relative_to(Path.cwd()):
-        inside = folder.relative_to(Path.cwd())
-        if inside.parts[:1] in (("outputs",), ("multirun",)):
-            made = (inside, *list(inside.parents)[:-1])
-    with contextlib.suppress(OSError):
-        for path in made:
-            path.rmdir()
+    if not in_sweep() or not folder.is_relative_to(Path.cwd()):
+        return
+    inside = folder.relative_to(Path.cwd())
+    if inside.parts[:1] in (("outputs",), ("multirun",)):
+        with contextlib.suppress(OSError):
+            for path in (inside, *list(inside.parents)[:-1]):
+                path.rmdir()

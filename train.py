@@ -17,6 +17,7 @@ import app
 import typed
 from torchrl_pref import runs, sweeps
 from torchrl_pref.errors import InputError
+from torchrl_pref.memory import check_memory
 from torchrl_pref.runs import CHECKPOINT
 from torchrl_pref.settings import check_run, check_train_settings
 from torchrl_pref.writing import write_text
@@ -159,6 +160,7 @@ def start(folder: Path, settings: dict[str, Any]) -> float:
 
     app.use_threads(settings)
     pools = experiment.make_pools(settings)
+    check_memory(settings, *pools[0].features.shape)
     task = experiment.make_task(*pools, settings["tau"])
     trainer = experiment.make_trainer(settings, task)
     comparison.check_evaluation(settings)

@@ -43,13 +43,15 @@ class Gate(Callback):
             if Gate.check is not None:
                 Gate.check(plain_settings(config))
         Gate.made = tuple(path for path in (folder, *folder.parents) if not path.exists())
-        Gate.passed = True
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Check where a sweep goes; each of its jobs checks its own configuration."""
         with one_line_errors(), refusals():
             Gate._check_hydra(config)
             _check_folder("hydra.sweep.dir", config.hydra.sweep.dir)
+
+    def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """From here on errors are a job's own."""
         Gate.passed = True
 
     @staticmethod
@@ -66,6 +68,13 @@ class Gate(Callback):
                 f"hydra.output_subdir={inside!r}: expected the name of a folder within that of the "
                 "run, such as hydra.output_subdir=hydra, or null"
             )
+
+
+def discard_folders() -> None:
+    """Remove the folders that Hydra made for a single run, as far as nothing is in them."""
+    with contextlib.suppress(OSError):
+        for path in Gate.made:
+            path.rmdir()
 
 
 @contextlib.contextmanager

@@ -21,6 +21,7 @@ from torchrl_pref.experiment import (
     make_feed_env,
     make_query_env,
 )
+from torchrl_pref.memory import check_memory
 from torchrl_pref.policies import Policy
 from torchrl_pref.queries import QueryPool
 from torchrl_pref.strategies import Greedy, QuantileAsk, RandomAsk, RandomQuery
@@ -45,7 +46,7 @@ def evaluate_panels(
     pool. It is evaluated on the held-out pool all the same, and on its own pool in a second panel.
 
     Args:
-        settings: the sections ``setup``, ``belief``, ``evaluation`` and ``device``.
+        settings: of the evaluation, or of the training that it ends.
         task: the pools and the response model.
         learned: checkpoints to evaluate, by the name to show.
         test: another held-out pool, normalised; by default the task's.
@@ -54,6 +55,8 @@ def evaluate_panels(
         By title: by name of the strategy, what it did.
     """
     held_out = task.test if test is None else test
+    evaluated = {key: value for key, value in settings.items() if key != "training"}
+    check_memory(evaluated, *held_out.features.shape)
     if not any(checkpoint.picks_by_index for checkpoint in learned.values()):
         return {task.title: compare(settings, task, held_out, learned)}
     return {

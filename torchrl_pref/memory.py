@@ -18,6 +18,9 @@ from torchrl_pref.errors import InputError
 N_FEATURES = 4
 """D of the Gridworld."""
 
+HELD_OUT = 2000
+"""Sessions that the held-out protocol runs at once in each worker: strategies times humans."""
+
 MOVED = 2**18
 """Samples that a belief moves at once."""
 
@@ -35,7 +38,7 @@ class Part(NamedTuple):
     """Settings that it grows with."""
 
 
-def check_memory(settings: dict[str, Any], pool_shape: tuple[int, int, int] | None = None) -> None:
+def check_memory(settings: dict[str, Any], *pool_shape: int) -> None:
     """Refuse sizes that cannot fit into this machine's memory.
 
     Args:
@@ -45,7 +48,7 @@ def check_memory(settings: dict[str, Any], pool_shape: tuple[int, int, int] | No
     Raises:
         InputError: the largest part of the run is estimated at more than there is.
     """
-    part = max(parts_of(settings, pool_shape), key=lambda part: part.size)
+    part = max(parts_of(settings, *pool_shape), key=lambda part: part.size)
     limit = machine_memory()
     if part.size > limit:
         named = ", ".join(f"{key}={_value_of(settings, key)}" for key in part.keys)
@@ -55,9 +58,7 @@ def check_memory(settings: dict[str, Any], pool_shape: tuple[int, int, int] | No
         )
 
 
-def parts_of(
-    settings: dict[str, Any], pool_shape: tuple[int, int, int] | None = None
-) -> Iterator[Part]:
+def parts_of(settings: dict[str, Any], *pool_shape: int) -> Iterator[Part]:
     """What a run keeps in memory, estimated."""
     pool, grid, setup = settings["pool"], settings["grid"], settings["setup"]
     n_queries, n_options, n_features = pool_shape or (pool["size"], pool["options"], N_FEATURES)
@@ -66,33 +67,38 @@ def parts_of(
     if of_gridworld:
         walks = 150.0 * pool["size"] * pool["options"] * grid["length"]
         yield Part("the pools", walks, (*sizes, "grid.length"))
-    samples, budget = settings["belief"]["samples"], setup["budget"]
-    offers = _offers(settings)
+    samples, budget, offers = settings["belief"]["samples"], setup["budget"], _offers(settings)
     beliefs = ("belief.samples", "setup.budget")
     if "training" in settings:
-        training = settings["training"]
-        steps = training["steps"] or offers or budget
+        steps = settings["training"]["steps"] or offers or budget
+        frames = settings["training"]["sessions"] * steps
         kept = 36.0 * samples * n_features
         kept += 5.0 * (budget * (16 + 4 * n_options) + 8 * offers + 100)
-        keys = ["training.sessions", "training.steps", *beliefs]
-        if setup["name"] == "query":
-            by_index = settings["policy"]["name"] == "paper"
-            candidates = None if by_index else setup["candidates"]
-            shown = min(n_queries, candidates or n_queries)
-            kept += shown * (700.0 + 10 * n_options * n_features)
-            if settings["policy"]["name"] == "attention":
-                kept += shown * n_options * (2500.0 + 50 * samples)
-            keys += [*sizes, "setup.candidates"]
-        else:
-            kept += 40.0 * n_options * n_features
-            keys.append("setup.offers")
-        yield Part("training", training["sessions"] * steps * kept, tuple(keys))
+        kept += _shown(settings, n_queries, n_options, n_features)
+        own = "setup.offers" if setup["name"] == "feed" else "setup.candidates"
+        keys = ("training.sessions", "training.steps", *beliefs, *sizes, own)
+        yield Part("training", frames * kept, keys)
     humans = settings["evaluation"]["humans"]
+    if settings.get("protocol") is not None:
+        humans = HELD_OUT * settings["workers"]
     each = 64.0 * samples * n_features + 220.0 * n_queries
     each += 2.5 * max(offers, budget) * (16 * budget + 50)
-    keys = ["evaluation.humans", *beliefs, *sizes]
+    counts = "evaluation.humans" if settings.get("protocol") is None else "workers"
+    keys = [counts, *beliefs, *sizes]
     yield Part("the evaluation", humans * each, tuple(keys))
     yield from _belief_parts(settings, n_options, n_features)
+
+
+def _shown(settings: dict[str, Any], n_queries: int, n_options: int, n_features: int) -> float:
+    """Bytes for each step of a training session that the queries on the table take."""
+    if settings["setup"]["name"] == "feed":
+        return 40.0 * n_options * n_features
+    by_index = settings["policy"]["name"] == "paper"
+    candidates = None if by_index else settings["setup"]["candidates"]
+    each = 700.0 + 10 * n_options * n_features
+    if settings["policy"]["name"] == "attention":
+        each += n_options * (2500.0 + 50 * settings["belief"]["samples"])
+    return min(n_queries, candidates or n_queries) * each
 
 
 def _belief_parts(settings: dict[str, Any], n_options: int, n_features: int) -> Iterator[Part]:

@@ -20,6 +20,7 @@ sys.path[0] = str(ROOT)  # not benchmarks, whose select.py would be found before
 
 import argparse
 import collections
+import functools
 import os
 import random
 import resource
@@ -284,6 +285,7 @@ def every_command() -> list[tuple[str, tuple[str, ...]]]:
 
 def run_forked(script: str, arguments: Sequence[str]) -> Result:
     """Run a command line in a fork of this process, up to where its work would start."""
+    _import_heavy()
     folder = Path(tempfile.mkdtemp(prefix="bad-settings-"))
     work = folder / "work"
     work.mkdir()
@@ -295,6 +297,16 @@ def run_forked(script: str, arguments: Sequence[str]) -> Result:
     outcome = _judge(status, out, errors, list(work.rglob("*")))
     shutil.rmtree(folder)
     return Result(script, tuple(arguments), outcome, errors)
+
+
+@functools.cache
+def _import_heavy() -> None:
+    """Once, and not in each fork."""
+    import torch
+
+    import torchrl_pref.heldout_report  # noqa: F401
+
+    torch.set_num_threads(1)
 
 
 def _be_command(script: str, arguments: Sequence[str], work: Path) -> None:
@@ -386,11 +398,6 @@ def main() -> None:
     commands, luck = every_command(), random.Random(typed.seed)
     if typed.sample is not None:
         commands = luck.sample(commands, typed.sample)
-    import torch
-
-    import torchrl_pref.heldout_report  # noqa: F401  all that is heavy, once
-
-    torch.set_num_threads(1)
     results = []
     for script, arguments in commands:
         results.append(result := run_forked(script, arguments))

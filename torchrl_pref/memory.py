@@ -84,8 +84,7 @@ def parts_of(settings: dict[str, Any], *pool_shape: int) -> Iterator[Part]:
     each = 64.0 * samples * n_features + 220.0 * n_queries
     each += 2.5 * max(offers, budget) * (16 * budget + 50)
     counts = "evaluation.humans" if settings.get("protocol") is None else "workers"
-    keys = [counts, *beliefs, *sizes]
-    yield Part("the evaluation", humans * each, tuple(keys))
+    yield Part("the evaluation", humans * each, (counts, *beliefs, *sizes))
     yield from _belief_parts(settings, n_options, n_features)
 
 
@@ -97,7 +96,7 @@ def _shown(settings: dict[str, Any], n_queries: int, n_options: int, n_features:
     candidates = None if by_index else settings["setup"]["candidates"]
     each = 700.0 + 10 * n_options * n_features
     if settings["policy"]["name"] == "attention":
-        each += n_options * (2500.0 + 50 * settings["belief"]["samples"])
+        each += 2500.0 * n_options
     return min(n_queries, candidates or n_queries) * each
 
 

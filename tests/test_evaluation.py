@@ -7,10 +7,11 @@ from test_envs import make
 from test_training import settings_of, trainer_of
 from torch import Generator
 
-from torchrl_pref.comparison import check_evaluation
+from torchrl_pref.acquisition import alignment_gain
+from torchrl_pref.comparison import check_evaluation, compare
 from torchrl_pref.envs import FeedEnv, QueryEnv
 from torchrl_pref.evaluation import CURVES, bootstrap_interval, draw_humans, evaluate
-from torchrl_pref.experiment import make_query_env
+from torchrl_pref.experiment import make_checkpoint, make_query_env
 from torchrl_pref.queries import QueryPool
 from torchrl_pref.strategies import Greedy, RandomAsk, RandomQuery
 
@@ -52,6 +53,15 @@ def test_feed_curves_count_answers_and_not_offers(pool: QueryPool) -> None:
     assert torch.equal(nothing.alignment[:, 0], nothing.alignment[:, -1])
 
 
+def test_repeats_are_asked_queries_and_not_open_slots(pool: QueryPool) -> None:
+    single = QueryPool(pool.features[:1])
+    env = make(FeedEnv, single, batch=40, offers=7)
+    result = evaluate(env, RandomAsk(0.4, seed=1), draw_humans(env))
+    assert result.asked.min() == 0
+    assert result.asked.max() > 2
+    assert torch.equal(result.repeated, (result.asked - 1).clamp(min=0))
+
+
 def test_strategies_face_the_same_humans_and_luck(pool: QueryPool) -> None:
     """With one query in the pool every strategy asks the same, and must hear the same."""
     single = QueryPool(pool.features[:1])
@@ -69,6 +79,30 @@ def test_strategies_face_the_same_humans_and_luck(pool: QueryPool) -> None:
     assert torch.equal(answers[0], answers[1])
     assert torch.equal(answers[0], answers[2])
     assert 0 < float(answers[0].float().mean()) < 1
+
+
+@pytest.mark.parametrize("setup", ["query", "feed"])
+def test_compared_strategies_have_the_luck_that_they_have_alone(setup: str) -> None:
+    """Nothing depends on what ran before: neither the belief's luck nor a policy's own dice."""
+    settings = settings_of(setup)
+    settings["policy"]["sample"] = True
+    trainer, task = trainer_of(settings)
+    checkpoint = make_checkpoint(settings, task, trainer)
+    results = compare(settings, task, task.test, {"one": checkpoint, "other": checkpoint})
+    n_humans, seed = check_evaluation(settings)
+    env = make_query_env(settings, task, task.test, n_humans, seed)
+    humans = draw_humans(env)
+    for name, strategy in (
+        ("greedy", Greedy(task.response_model)),
+        ("greedy alignment", Greedy(task.response_model, alignment_gain)),
+    ):
+        env.set_seed(seed)
+        alone = evaluate(env, strategy, humans)
+        for curve in CURVES:
+            assert torch.equal(getattr(results[name], curve), getattr(alone, curve)), (name, curve)
+    for curve in CURVES:
+        assert torch.equal(getattr(results["one"], curve), getattr(results["other"], curve))
+    assert len({float(result.alignment[:, 0].sum()) for result in results.values()}) == 1
 
 
 def test_bootstrap_agrees_with_scipy(generator: Generator) -> None:

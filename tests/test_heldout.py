@@ -53,6 +53,14 @@ def test_interval_covers_pools_and_seeds(generator: Generator) -> None:
     assert two_way_interval(torch.full((3, 2), 0.7)) == (pytest.approx(0.7), pytest.approx(0.7))
 
 
+def test_interval_is_widened_by_what_few_pools_hide() -> None:
+    """Two pools at 0 and 1: a bootstrap's mean is 0, 1/2 or 1, and its interval all of it. Of the
+    variance between two pools it shows half."""
+    low, high = two_way_interval(torch.tensor([[0.0], [1.0]]))
+    assert low == pytest.approx(0.5 - 0.5 * 2**0.5)
+    assert high == pytest.approx(0.5 + 0.5 * 2**0.5)
+
+
 def test_differences_are_paired_and_levels_are_reached() -> None:
     rising = torch.linspace(0, 1, 11).expand(2, 3, 4, 11)
     one, other = outcome(rising), outcome(rising[:, :1] - 0.25)

@@ -103,6 +103,24 @@ def test_skips_are_free_and_offers_run_out(pool: QueryPool) -> None:
     assert not session["truncated"].any()
 
 
+@pytest.mark.parametrize("on_skip", ["new", "repeat"])
+def test_running_out_of_free_offers_is_an_end_and_no_interruption(
+    on_skip: str, pool: QueryPool
+) -> None:
+    """An interruption would tell the critic to add what might have come after the last offer."""
+    env = make(FeedEnv, pool, batch=60, offers=9, skip="free", on_skip=on_skip)
+    data = env.rollout(9, coin(env, 1), break_when_any_done=False)
+    assert data.shape == (60, 9)
+    ended = data["next", "done"].squeeze(-1)
+    out_of_offers = (data["next", "n_offered"] == 9).squeeze(-1)
+    full = (data["next", "n_asked"] == 5).squeeze(-1)
+    assert torch.equal(ended, out_of_offers | full)
+    assert (out_of_offers & ~full).any()
+    assert (full & ~out_of_offers).any()
+    assert torch.equal(data["next", "terminated"], data["next", "done"])
+    assert not data["next", "truncated"].any()
+
+
 def test_entropy_falls_by_a_bit_for_a_halved_interval() -> None:
     """On the circle: D - 1 = 1 direction. A belief half as wide has lost one bit."""
     potentials = []

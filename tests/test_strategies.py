@@ -103,6 +103,22 @@ def test_threshold_asks_above_it_and_at_the_end(pool: QueryPool) -> None:
         assert torch.equal(data["action"][:, step] == 1, asks)
 
 
+@pytest.mark.parametrize("left", [1, 2, 5])
+def test_the_last_offers_are_asked_however_poor(left: int, pool: QueryPool) -> None:
+    """With as many offers left as asks, each must be asked; with one offer more, none must."""
+    env = make(FeedEnv, pool, batch=10, offers=12, skip="free")
+    session = session_of(env)
+    # Of two options that are alike nothing can be learned: no query of the pool is poorer.
+    session["offer"] = pool.features[0, 0].expand_as(session["offer"]).clone()
+    session["n_asked"].fill_(5 - left)
+    rules = [ThresholdAsk(env, 0.5), QuantileAsk(env), QuantileAsk(env, alignment_gain)]
+    rules.append(QuantileAsk(env, information_gain, late=alignment_gain))
+    for more, asks in ((0, 1), (1, 0)):
+        session["n_offered"].fill_(12 - left - more)
+        for rule in rules:
+            assert (rule(session.clone())["action"] == asks).all()
+
+
 @pytest.mark.parametrize("left", [1.0, 0.25])
 def test_rank_by_two_functions_weighs_them_by_the_asks_left(left: float, pool: QueryPool) -> None:
     env = make(FeedEnv, pool, batch=40, skip="free")

@@ -16,10 +16,11 @@ import hydra
 from omegaconf import DictConfig
 
 import app
-from torchrl_pref import comparison, experiment, heldout, heldout_report, reports
+from torchrl_pref import comparison, experiment, heldout, heldout_report, reports, training_report
 from torchrl_pref.checkpoint import FILE_NAME, Checkpoint
 from torchrl_pref.errors import InputError, check_choice, check_count, one_line_errors
 from torchrl_pref.pretrained import SEEDS, pretrained_checkpoint
+from torchrl_pref.progress import Progress
 from torchrl_pref.queries import QueryPool
 
 PROTOCOL_KEYS = (
@@ -38,8 +39,8 @@ PROTOCOL_KEYS = (
 )
 """What may be typed beside ``protocol``; the rest is the protocol's own."""
 
-Evaluated = tuple[comparison.Panels, dict[str, dict[str, list[float]]]]
-"""Panels of evaluations, and the training histories behind them."""
+Evaluated = tuple[comparison.Panels, dict[str, Progress]]
+"""Panels of evaluations, and the trainings behind them."""
 
 
 @hydra.main(config_path="conf", config_name="evaluate", version_base="1.3")
@@ -69,14 +70,16 @@ def job(config: DictConfig) -> None:
                         "them; pretrained policies are files too: checkpoint=[a.pt,b.pt]"
                     )
                 panels = evaluate_taus(settings, partial(pretrained_for, settings))
-                reports.write_report(folder, panels, {})
+                reports.write_report(folder, panels)
             elif named is None:
-                reports.write_report(folder, evaluate_taus(settings, lambda tau: {}), {})
+                reports.write_report(folder, evaluate_taus(settings, lambda tau: {}))
             else:
                 allowed = ("evaluation.", "pool.test", "device", "threads", "hydra.")
                 app.refuse_other_overrides("checkpoint", allowed)
                 paths = find_checkpoints([str(name) for name in listed(named)])
-                reports.write_report(folder, *evaluate_checkpoints(settings, paths))
+                panels, trained = evaluate_checkpoints(settings, paths)
+                reports.write_report(folder, panels)
+                training_report.write_training(folder, trained)
     finally:
         app.discard_if_empty(folder)
 
@@ -173,11 +176,11 @@ def evaluate_checkpoints(settings: dict[str, Any], paths: list[Path]) -> Evaluat
             test = QueryPool.load(settings["pool"]["test"]).map_features(task.normalizer)
         panels |= comparison.evaluate_panels(panel_settings, task, learned, test)
     titles = [f"{comparison.label_of(c.settings)}, {task.title}" for _, c, task in runs]
-    histories = {}
+    trained = {}
     for title, (name, checkpoint, _) in zip(titles, runs, strict=True):
         unique = title if titles.count(title) == 1 else f"{title}, {name}"
-        histories[unique] = checkpoint.history
-    return panels, histories
+        trained[unique] = checkpoint.progress
+    return panels, trained
 
 
 if __name__ == "__main__":

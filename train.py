@@ -14,9 +14,10 @@ import hydra
 from omegaconf import DictConfig, OmegaConf
 
 import app
-from torchrl_pref import comparison, experiment, reports
+from torchrl_pref import comparison, experiment, reports, training_report
 from torchrl_pref.checkpoint import FILE_NAME, Checkpoint
 from torchrl_pref.errors import InputError, one_line_errors
+from torchrl_pref.learning_curve import LearningCurve
 from torchrl_pref.training import Trainer
 
 POOLS = ("train_pool.pt", "test_pool.pt")
@@ -52,7 +53,7 @@ def begin(folder: Path, settings: dict[str, Any], start: str | None) -> float:
     pools = experiment.make_pools(settings)
     task = experiment.make_task(*pools, settings["tau"])
     trainer = experiment.make_trainer(settings, task)
-    comparison.check_evaluation(settings)
+    curve = LearningCurve(settings, task, trainer)
     if start is not None:
         checkpoint = Checkpoint.load(start)
         checkpoint.check_fits(task.train, own_indices=True)
@@ -61,7 +62,7 @@ def begin(folder: Path, settings: dict[str, Any], start: str | None) -> float:
     for pool, name in zip(pools, POOLS, strict=True):
         pool.save(folder / name)
     OmegaConf.save(settings, folder / "config.yaml")
-    return train(folder, settings, task, trainer)
+    return train(folder, settings, task, trainer, curve)
 
 
 def go_on(folder: Path, typed: dict[str, Any]) -> float:
@@ -86,10 +87,16 @@ def go_on(folder: Path, typed: dict[str, Any]) -> float:
     done, updates = trainer.progress.update, settings["training"]["updates"]
     if done >= updates:
         print(f"{done} updates are done; train further with training.updates={2 * done}")
-    return train(folder, settings, task, trainer)
+    return train(folder, settings, task, trainer, LearningCurve(settings, task, trainer))
 
 
-def train(folder: Path, settings: dict[str, Any], task: experiment.Task, trainer: Trainer) -> float:
+def train(
+    folder: Path,
+    settings: dict[str, Any],
+    task: experiment.Task,
+    trainer: Trainer,
+    curve: LearningCurve,
+) -> float:
     """Train, evaluate on the held-out pool, report."""
     setup = settings["setup"]["name"]
     print(f"{setup} setup, {task.title}, run folder {folder}")
@@ -98,7 +105,7 @@ def train(folder: Path, settings: dict[str, Any], task: experiment.Task, trainer
         experiment.make_checkpoint(settings, task, trainer).save(folder / FILE_NAME)
 
     go_on_line = f"go on with: python train.py resume={shlex.quote(str(folder))}"
-    if not trainer.run(folder, save):
+    if not trainer.run(folder, save, curve.measure):
         print(f"stopped after {trainer.progress.update} updates; {go_on_line}")
         sys.exit(130)
     label = comparison.label_of(settings)
@@ -108,7 +115,8 @@ def train(folder: Path, settings: dict[str, Any], task: experiment.Task, trainer
     except KeyboardInterrupt:
         print(f"\ntrained, not evaluated; {go_on_line}")
         sys.exit(130)
-    reports.write_report(folder, panels, {label: trainer.progress.history})
+    reports.write_report(folder, panels)
+    training_report.write_training(folder, {label: trainer.progress})
     held_out = next(iter(panels.values()))[label]
     reports.write_summary(folder, settings["overrides"], held_out)
     if (folder.parent / "multirun.yaml").exists():  # Hydra's mark of a sweep

@@ -1,3 +1,5 @@
+import math
+
 import numpy as np
 import pytest
 import scipy.stats
@@ -12,6 +14,7 @@ from torchrl_pref.comparison import check_evaluation, compare
 from torchrl_pref.envs import FeedEnv, QueryEnv
 from torchrl_pref.evaluation import CURVES, bootstrap_interval, draw_humans, evaluate
 from torchrl_pref.experiment import make_checkpoint, make_query_env
+from torchrl_pref.policies import paper_policy
 from torchrl_pref.queries import QueryPool
 from torchrl_pref.strategies import Greedy, RandomAsk, RandomQuery
 
@@ -79,6 +82,21 @@ def test_strategies_face_the_same_humans_and_luck(pool: QueryPool) -> None:
     assert torch.equal(answers[0], answers[1])
     assert torch.equal(answers[0], answers[2])
     assert 0 < float(answers[0].float().mean()) < 1
+
+
+def test_a_policy_draws_its_actions_only_where_it_is_told_to(pool: QueryPool) -> None:
+    env = make(FeedEnv, pool, batch=200, offers=20)
+    policy = paper_policy(env)
+    with torch.no_grad():
+        for weight in policy.weights.parameters():
+            weight.zero_()
+        list(policy.actor.parameters())[-1][1] = 1.0  # asks with probability e / (1 + e)
+    humans = draw_humans(env)
+    assert (evaluate(env, policy.strategy, humans).offered == 5).all()
+    drawn = evaluate(env, policy.strategy, humans, sample=True)
+    assert (drawn.asked == 5).all()
+    # Offers until the fifth ask: a negative binomial.
+    assert float(drawn.offered.float().mean()) == pytest.approx(5 * (1 + 1 / math.e), abs=0.5)
 
 
 @pytest.mark.parametrize("setup", ["query", "feed"])

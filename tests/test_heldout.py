@@ -24,7 +24,7 @@ from torchrl_pref.heldout import (
     two_way_interval,
 )
 from torchrl_pref.heldout_report import paired, reaches, write_heldout
-from torchrl_pref.queries import gridworld_pool
+from torchrl_pref.queries import QueryPool, gridworld_pool
 from torchrl_pref.strategies import RandomAsk
 
 
@@ -107,6 +107,9 @@ def test_protocol_pairs_all_strategies_on_pools_of_its_own(
         for name, results in row.items():
             if "M=40" not in name:
                 assert torch.equal(results[0].alignment[:, 0], start)
+    # Another pool, other humans.
+    first, second = (row["RL"][0].alignment[:, 0] for row in rows)
+    assert not torch.isclose(first, second).any()
     trained = make_pools(settings)
     for pool in (0, 1):
         _, own = heldout._task_and_pool(Job(settings, cell, pool))
@@ -115,6 +118,32 @@ def test_protocol_pairs_all_strategies_on_pools_of_its_own(
     write_heldout(tmp_path, {cell: heldout._gather(rows)})
     assert (tmp_path / "heldout.png").stat().st_size > 10_000
     assert "RL minus it" in (tmp_path / "heldout.txt").read_text()
+
+
+def test_no_two_pools_share_a_seed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pool takes its seed for the starts and the next one for the moves."""
+    seeds: list[int] = []
+
+    def watched(n_queries: int, n_options: int, size: int, length: int, seed: int) -> QueryPool:
+        seeds.extend((seed, seed + 1))
+        return gridworld_pool(n_queries, n_options, size, length, seed)
+
+    monkeypatch.setattr(heldout, "gridworld_pool", watched)
+    monkeypatch.setattr("torchrl_pref.experiment.gridworld_pool", watched)
+    for pool in range(heldout.POOLS):
+        heldout._task_and_pool(Job(settings_of("feed"), Cell("feed", "noisy"), pool))
+    per_call = 2 * 3  # training, test, and the pool itself
+    assert len(seeds) == per_call * heldout.POOLS
+    assert len(set(seeds)) == 4 + 2 * heldout.POOLS
+
+
+def test_the_threshold_is_fitted_without_a_look_at_the_test_pools() -> None:
+    fits = []
+    for pool in (0, 1):
+        job = Job(settings_of("feed"), Cell("feed", "noisy"), pool, thresholds=(0.1, 0.4))
+        fits.append(heldout._fit_threshold(job))
+    assert torch.equal(*fits)
+    assert fits[0][0] != fits[0][1]
 
 
 def test_policies_of_other_tasks_are_refused() -> None:

@@ -19,6 +19,7 @@ from torchrl_pref.objectives import make_objective
 from torchrl_pref.queries import QueryPool
 from torchrl_pref.responses import Prediction, ResponseModel
 from torchrl_pref.strategies import (
+    REFERENCE,
     Greedy,
     Lookahead,
     OfferRank,
@@ -140,6 +141,17 @@ def test_rank_by_two_functions_weighs_them_by_the_asks_left(left: float, pool: Q
     own = [rank_of(first["samples"], query.expand(40, -1, -1), share) for query in pool.features]
     highest = (len(pool) - 0.5) / len(pool)
     assert torch.stack(own).amax().item() == pytest.approx(highest, abs=1e-6)
+
+
+def test_rank_is_that_among_the_whole_pool(generator: Generator) -> None:
+    """Of a pool larger than the sample, whose first half teaches nothing."""
+    features = torch.randn(2 * REFERENCE, 2, 4, generator=generator)
+    features[:REFERENCE, 1] = features[:REFERENCE, 0]
+    env = make(FeedEnv, QueryPool(features), batch=80, skip="free")
+    offers = features[REFERENCE :: REFERENCE // 80][:80]
+    rank = OfferRank(env, information_gain)(env.reset()["samples"], offers, torch.ones(80, 1))
+    assert float(rank.mean()) == pytest.approx(0.75, abs=0.05)
+    assert rank.amin() > 0.5
 
 
 def test_rank_keeps_scores_only_while_the_belief_stays(pool: QueryPool) -> None:

@@ -10,7 +10,12 @@ from test_training import settings_of, trainer_of
 from torch import Generator
 
 from torchrl_pref.acquisition import alignment_gain
-from torchrl_pref.comparison import check_evaluation, compare
+from torchrl_pref.comparison import (
+    check_evaluation,
+    compare,
+    evaluate_panels,
+    group_checkpoints,
+)
 from torchrl_pref.envs import FeedEnv, QueryEnv
 from torchrl_pref.evaluation import CURVES, bootstrap_interval, draw_humans, evaluate
 from torchrl_pref.experiment import make_checkpoint, make_query_env
@@ -121,6 +126,30 @@ def test_compared_strategies_have_the_luck_that_they_have_alone(setup: str) -> N
     for curve in CURVES:
         assert torch.equal(getattr(results["one"], curve), getattr(results["other"], curve))
     assert len({float(result.alignment[:, 0].sum()) for result in results.values()}) == 1
+
+
+def test_a_policy_that_picks_indices_is_shown_on_its_own_pool_too() -> None:
+    settings = settings_of("query", "paper")
+    trainer, task = trainer_of(settings)
+    learned = {"RL": make_checkpoint(settings, task, trainer)}
+    held_out, own = evaluate_panels(settings, task, learned).items()
+    assert held_out[0].endswith("held-out pool")
+    assert own[0].endswith("training pool")
+    for (_, results), pool in ((held_out, task.test), (own, task.train)):
+        for name, result in compare(settings, task, pool, learned).items():
+            assert torch.equal(results[name].alignment, result.alignment)
+    assert not torch.equal(held_out[1]["RL"].alignment, own[1]["RL"].alignment)
+
+
+def test_runs_of_one_kind_are_told_apart_by_their_names() -> None:
+    runs = []
+    for name, setup in (("a", "query"), ("b", "query"), ("c", "feed")):
+        settings = settings_of(setup)
+        trainer, task = trainer_of(settings)
+        runs.append((name, make_checkpoint(settings, task, trainer), task))
+    ((settings, _, learned),) = group_checkpoints(runs)
+    assert list(learned) == ["RL (a)", "RL (b)", "RL-feed"]
+    assert settings["setup"]["name"] == "feed"  # the baselines of a feed are shown too
 
 
 def test_bootstrap_agrees_with_scipy(generator: Generator) -> None:

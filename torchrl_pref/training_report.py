@@ -22,7 +22,7 @@ from torchrl_pref.reports import NAMES, STYLE, save_figure, signed
 PANELS = {
     "train/alignment": "alignment in training",
     "train/reward": "reward of an episode",
-    "train/episode_length": "steps of an episode",
+    "train/episode_length": "offers seen in an episode",
     "train/explained_variance": "share of the returns\nthat the critic foresees",
 }
 """What is drawn of the training episodes, and what it is called."""
@@ -98,9 +98,9 @@ def training_figure(name: str, progress: Progress, path: Path) -> None:
         _draw_gain(axes["gain"], name, progress)
         count = len(next(iter(progress.held_out.values())))
         figure.supxlabel(
-            f"above: alignment after the last query, mean of {count} humans whom no training met; "
-            "each time the same humans with the same luck; bands and bars are 95% intervals. "
-            "below: means over the training episodes",
+            f"above: alignment after the last query, mean of {count} humans that no training met, "
+            "the same ones with the same luck\neach time; band and bars are 95% intervals; "
+            "below: means over the episodes of the training",
             fontsize="small",
             color="#555555",
         )
@@ -110,7 +110,7 @@ def training_figure(name: str, progress: Progress, path: Path) -> None:
         )
         axes[key].set_ylabel(PANELS[key])
     for axis in axes.values():
-        axis.set_xlabel("updates of the policy")
+        axis.set_xlabel("policy updates")
         axis.grid(alpha=0.25)
     save_figure(figure, path)
 
@@ -118,19 +118,19 @@ def training_figure(name: str, progress: Progress, path: Path) -> None:
 def _draw_level(axis: Axes, name: str, progress: Progress) -> None:
     """Alignment by update, beside the start's and the baseline's."""
     updates = sorted(progress.held_out)
-    levels = {}
-    if progress.baseline is not None:
-        baseline, values = progress.baseline
-        levels[NAMES.get(baseline, baseline)] = STYLE[baseline], values
-    levels["the policy before training"] = START, progress.held_out[updates[0]]
-    for label, ((color, line), values) in levels.items():
-        axis.axhline(float(values.mean()), color=color, linestyle=line, label=label)
     alignments = [progress.held_out[update] for update in updates]
     means = [float(values.mean()) for values in alignments]
     low, high = zip(*map(bootstrap_interval, alignments), strict=True)
     color, _ = _style(name)
+    axis.plot(updates, means, color=color, marker="o", zorder=3, label=f"{name}, as it learns")
     axis.fill_between(updates, low, high, color=color, alpha=0.15, lw=0)
-    axis.plot(updates, means, color=color, marker="o", label=f"{name}, as it learns")
+    others = {}
+    if progress.baseline is not None:
+        baseline, values = progress.baseline
+        others[NAMES.get(baseline, baseline)] = STYLE[baseline], values
+    others["the policy before training"] = START, alignments[0]
+    for label, ((color, line), values) in others.items():
+        axis.axhline(float(values.mean()), color=color, linestyle=line, label=label)
     axis.set_ylabel("alignment with held-out humans")
     _legend_above(axis)
 
@@ -138,10 +138,10 @@ def _draw_level(axis: Axes, name: str, progress: Progress) -> None:
 def _draw_gain(axis: Axes, name: str, progress: Progress) -> None:
     """Paired differences of the policy to its start and to the baseline, by update."""
     updates = sorted(progress.held_out)
-    others = {"minus the policy before training": (START[0], progress.held_out[updates[0]])}
+    others = {"the policy before training": (START[0], progress.held_out[updates[0]])}
     if progress.baseline is not None:
         baseline, values = progress.baseline
-        others[f"minus {NAMES.get(baseline, baseline)}"] = (STYLE[baseline][0], values)
+        others[NAMES.get(baseline, baseline)] = (STYLE[baseline][0], values)
     apart = 0.006 * (updates[-1] - updates[0])  # side by side, or bars would hide each other
     for side, (label, (color, other)) in zip((-apart, apart), others.items(), strict=False):
         gains = [progress.held_out[update] - other for update in updates]
@@ -149,9 +149,11 @@ def _draw_gain(axis: Axes, name: str, progress: Progress) -> None:
         bounds = torch.tensor([bootstrap_interval(gain) for gain in gains]).T
         bars = (bounds - means).abs()
         places = [update + side for update in updates]
-        axis.errorbar(places, means, bars, color=color, marker="o", capsize=3, label=label)
+        axis.errorbar(
+            places, means, bars, color=color, marker="o", capsize=3, label=f"{name} minus {label}"
+        )
     axis.axhline(0, color="#555555", lw=0.8)
-    axis.set_ylabel(f"{name}: difference in alignment,\nhuman by human")
+    axis.set_ylabel("difference in alignment,\nhuman by human")
     _legend_above(axis)
 
 

@@ -53,7 +53,7 @@ def begin(folder: Path, settings: dict[str, Any], start: str | None) -> float:
     pools = experiment.make_pools(settings)
     task = experiment.make_task(*pools, settings["tau"])
     trainer = experiment.make_trainer(settings, task)
-    curve = LearningCurve(settings, task, trainer)
+    comparison.check_evaluation(settings)
     if start is not None:
         checkpoint = Checkpoint.load(start)
         checkpoint.check_fits(task.train, own_indices=True)
@@ -62,7 +62,7 @@ def begin(folder: Path, settings: dict[str, Any], start: str | None) -> float:
     for pool, name in zip(pools, POOLS, strict=True):
         pool.save(folder / name)
     OmegaConf.save(settings, folder / "config.yaml")
-    return train(folder, settings, task, trainer, curve)
+    return train(folder, settings, task, trainer)
 
 
 def go_on(folder: Path, typed: dict[str, Any]) -> float:
@@ -87,16 +87,10 @@ def go_on(folder: Path, typed: dict[str, Any]) -> float:
     done, updates = trainer.progress.update, settings["training"]["updates"]
     if done >= updates:
         print(f"{done} updates are done; train further with training.updates={2 * done}")
-    return train(folder, settings, task, trainer, LearningCurve(settings, task, trainer))
+    return train(folder, settings, task, trainer)
 
 
-def train(
-    folder: Path,
-    settings: dict[str, Any],
-    task: experiment.Task,
-    trainer: Trainer,
-    curve: LearningCurve,
-) -> float:
+def train(folder: Path, settings: dict[str, Any], task: experiment.Task, trainer: Trainer) -> float:
     """Train, evaluate on the held-out pool, report."""
     setup = settings["setup"]["name"]
     print(f"{setup} setup, {task.title}, run folder {folder}")
@@ -105,7 +99,7 @@ def train(
         experiment.make_checkpoint(settings, task, trainer).save(folder / FILE_NAME)
 
     go_on_line = f"go on with: python train.py resume={shlex.quote(str(folder))}"
-    if not trainer.run(folder, save, curve.measure):
+    if not trainer.run(folder, save, LearningCurve(settings, task, trainer).measure):
         print(f"stopped after {trainer.progress.update} updates; {go_on_line}")
         sys.exit(130)
     label = comparison.label_of(settings)

@@ -1,3 +1,5 @@
+import math
+
 import pytest
 import torch
 from conftest import RESPONSE_MODELS
@@ -7,7 +9,12 @@ from torch import Generator
 from torch.nn import functional as F
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_pref.acquisition import alignment_gain, information_gain
+from torchrl_pref.acquisition import (
+    alignment_gain,
+    information_gain,
+    predict_answers,
+    volume_removal,
+)
 from torchrl_pref.attention import TOKENS, belief_tokens
 from torchrl_pref.belief import covariance_of
 from torchrl_pref.envs import FeedEnv, QueryEnv
@@ -15,7 +22,13 @@ from torchrl_pref.objectives import make_objective
 from torchrl_pref.policies import Policy, attention_policy, paper_policy, scorer_policy
 from torchrl_pref.queries import QueryPool
 from torchrl_pref.responses import ResponseModel
-from torchrl_pref.scorer import FEED_SCALE, PATIENCE_SCALE, BeliefFeatures, OfferScorer
+from torchrl_pref.scorer import (
+    FEED_SCALE,
+    PATIENCE_SCALE,
+    BeliefFeatures,
+    CandidateFeatures,
+    OfferScorer,
+)
 from torchrl_pref.strategies import QuantileAsk, RandomAsk, RandomQuery
 
 
@@ -128,6 +141,20 @@ def test_patience_grows_the_share_by_how_late_the_asks_left_are(pool: QueryPool)
         assert torch.allclose(logits[:, 1] - rule[:, 1], torch.tensor(expected), atol=1e-3)
 
 
+def test_patience_shrinks_the_share_by_the_misalignment_that_is_left(pool: QueryPool) -> None:
+    env = make(FeedEnv, pool, batch=30, offers=100, skip="free")
+    session = session_of(env)
+    rule = with_patience(scorer_policy(env), 0.0, 0.0).strategy(session.clone())["logits"]
+    # A patience of one per unit of urgency multiplies the share by e times the misalignment.
+    policy = with_patience(scorer_policy(env), 0.0, 1 / PATIENCE_SCALE)
+    logits = policy.strategy(session.clone())["logits"]
+    left = 1 - session["samples"].mean(1).square().sum(-1)
+    assert left.amin() < 0.8
+    share = (env.budget - session["n_asked"]) / (env.n_offers - session["n_offered"])
+    expected = FEED_SCALE * share.squeeze(-1) * (math.e * left - 1)
+    assert torch.allclose(logits[:, 1] - rule[:, 1], expected, atol=1e-3)
+
+
 @pytest.mark.parametrize("left", [1, 2, 5])
 def test_the_last_offers_are_asked_whatever_was_learned(left: int, pool: QueryPool) -> None:
     """With as many offers left as asks, each must be asked; with one offer more, none must."""
@@ -157,6 +184,29 @@ def test_patience_waits_when_the_belief_is_sure(pool: QueryPool) -> None:
     after = [policy.strategy(each.clone())["logits"][:, 1] for each in (session, sure)]
     assert (after[0] > rule[0]).all()
     assert (after[1] < rule[1]).all()
+
+
+@pytest.mark.parametrize("options", [2, 3])
+def test_candidates_are_described_by_what_the_belief_knows(
+    options: int, generator: Generator
+) -> None:
+    """Option by option: how far its return lies from the mean return of its query."""
+    env = make(QueryEnv, QueryPool(torch.randn(9, options, 4, generator=generator)))
+    session, model = session_of(env), env.belief.response_model
+    found = CandidateFeatures(model)(session["samples"], session["queries"])
+    for b, c in ((0, 0), (1, 4), (3, 8)):
+        samples, features = session["samples"][b], session["queries"][b, c]
+        predicted = predict_answers(samples[None], features[None, None], model)
+        scores = [
+            float(function(predicted, samples[None]))
+            for function in (information_gain, alignment_gain, volume_removal)
+        ]
+        returns = samples @ features.T  # (M K)
+        apart = returns - returns.mean(1, keepdim=True)
+        variance = float(apart.var(0, correction=0).sum())
+        scores += [variance**0.5, variance, float(apart.mean(0).norm())]
+        scores.append(float((features - features.mean(0)).norm()))
+        assert found[b, c].tolist() == pytest.approx(scores, abs=1e-4)
 
 
 @pytest.mark.parametrize("n_features", [2, 3, 5])

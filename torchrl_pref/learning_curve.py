@@ -17,7 +17,6 @@ from torchrl_pref.acquisition import alignment_gain
 from torchrl_pref.checkpoint import picks_by_index
 from torchrl_pref.comparison import check_evaluation
 from torchrl_pref.envs import FeedEnv, QueryEnv
-from torchrl_pref.errors import check_count
 from torchrl_pref.evaluation import draw_humans, evaluate
 from torchrl_pref.experiment import Settings, Task, make_policy, make_training_env
 from torchrl_pref.policies import Policy
@@ -50,9 +49,7 @@ class LearningCurve:
 
     def __init__(self, settings: Settings, task: Task, trainer: Trainer) -> None:
         n_humans, _ = check_evaluation(settings)
-        # Runs of version 0.1.0 have no such setting.
-        during = settings["evaluation"].get("during", 0)
-        self.times = check_count("evaluation.during", during, 0)
+        self.times = settings["evaluation"].get("during", 0)  # version 0.1.0 knew no such key
         self.n_humans, self.seed = min(n_humans, HUMANS), LAST_SEED - settings["evaluation"]["seed"]
         self.settings, self.task, self.trainer = settings, task, trainer
 

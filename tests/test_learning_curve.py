@@ -207,3 +207,13 @@ def test_report_says_what_was_learned(
     write_training(tmp_path, {"RL": progress})
     assert f"RL: {line}" in capsys.readouterr().out
     assert (tmp_path / "training.png").read_bytes() != plain
+
+
+@pytest.mark.parametrize("during", [0, 1])
+@pytest.mark.parametrize("setup", ["query", "feed"])
+def test_the_shortest_training_has_a_figure(setup: str, during: int, tmp_path: Path) -> None:
+    """One update, in which no episode ended."""
+    trainer, curve, _, _ = watched(during, setup, updates=1)
+    trainer.run(tmp_path, lambda: None, curve.measure)
+    write_training(tmp_path, {"RL": trainer.progress})
+    assert (tmp_path / "training.png").stat().st_size > 5000

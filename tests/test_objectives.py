@@ -7,6 +7,7 @@ from conftest import RESPONSE_MODELS
 from reference import answer_probs
 from test_envs import coin, make
 from test_policies import session_of
+from torch import Generator
 
 from torchrl_pref.belief import Belief
 from torchrl_pref.envs import FeedEnv, QueryEnv
@@ -129,6 +130,17 @@ def test_entropy_falls_by_a_bit_for_a_halved_interval() -> None:
         samples = torch.stack([angles.cos(), angles.sin()], -1).unsqueeze(0)
         potentials.append(make_objective("entropy").potential({"samples": samples}))  # type: ignore[arg-type]
     assert float(potentials[1] - potentials[0]) == pytest.approx(1, abs=0.02)
+
+
+def test_entropy_is_told_by_the_distance_to_the_third_nearest(generator: Generator) -> None:
+    samples = torch.randn(2, 30, 4, generator=generator)
+    expected = []
+    for each in samples.double().numpy():
+        distances = np.linalg.norm(each[:, None] - each, axis=-1)
+        third = np.sort(distances, axis=1)[:, 3]  # the nearest of all is the sample itself
+        expected.append(-3 * np.log2(third).mean())
+    potential = make_objective("entropy").potential({"samples": samples})  # type: ignore[arg-type]
+    assert potential.squeeze(-1).tolist() == pytest.approx(expected, abs=1e-4)
 
 
 def test_unknown_objective_is_refused() -> None:

@@ -23,7 +23,7 @@ from torchrl_pref.policies import Policy
 from torchrl_pref.strategies import Greedy, QuantileAsk
 from torchrl_pref.training import Trainer
 
-HUMANS = 50
+HUMANS = 100
 """At most: all evaluations of a training together are to take a small part of its time."""
 
 LAST_SEED = 2**32 - 1

@@ -82,7 +82,7 @@ def training_figure(name: str, progress: Progress, path: Path) -> None:
         path: of the figure.
     """
     history = progress.history
-    below = [key for key in PANELS if key in history and _varies(history[key])]
+    below = [key for key in PANELS if key != "train/episode_length" or _varies(history[key])]
     rows = [below]
     if progress.held_out:
         below = [key for key in below if key != "train/alignment"]
@@ -105,9 +105,8 @@ def training_figure(name: str, progress: Progress, path: Path) -> None:
             color="#555555",
         )
     for key in below:
-        axes[key].plot(
-            *smoothed(history[key], even_edges(len(history[key]))), color=_style(name)[0]
-        )
+        points = smoothed(history[key], even_edges(len(history[key])))
+        axes[key].plot(*points, color=_style(name)[0], marker=".", markersize=3)
         axes[key].set_ylabel(PANELS[key])
     for axis in axes.values():
         axis.set_xlabel("policy updates")

@@ -1,4 +1,5 @@
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -102,6 +103,17 @@ def test_a_policy_draws_its_actions_only_where_it_is_told_to(pool: QueryPool) ->
     assert (drawn.asked == 5).all()
     # Offers until the fifth ask: a negative binomial.
     assert float(drawn.offered.float().mean()) == pytest.approx(5 * (1 + 1 / math.e), abs=0.5)
+
+
+def test_time_is_told_for_each_asked_query(
+    pool: QueryPool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env = make(FeedEnv, pool, batch=8, offers=7)
+    humans = draw_humans(env)
+    clock = SimpleNamespace(perf_counter=iter([10.0, 12.0]).__next__)
+    monkeypatch.setattr("torchrl_pref.evaluation.time", clock)
+    result = evaluate(env, RandomAsk(0.4, seed=1), humans)
+    assert result.seconds_per_query == pytest.approx(2.0 / int(result.asked.sum()))
 
 
 @pytest.mark.parametrize("setup", ["query", "feed"])

@@ -165,6 +165,19 @@ def test_normaliser_is_that_of_the_training_pool() -> None:
     assert own.features.mean().abs() > 1e-6
 
 
+def test_features_are_balanced_by_the_training_pool() -> None:
+    task, own = heldout._task_and_pool(
+        Job(settings_of("query"), Cell("query", "noisy", "balanced"), 0)
+    )
+    largest = []
+    for pool in (task.train, own):
+        gaps = pool.features[:, 0] - pool.features[:, 1]
+        covariance = gaps.mT @ gaps / len(gaps)
+        largest.append(float((covariance - covariance.diagonal().diag()).abs().amax()))
+    assert largest[0] < 1e-3
+    assert largest[1] > 0.05
+
+
 def test_strategies_side_by_side_meet_the_same_offers_and_humans() -> None:
     """A strategy beside others does what it does alone where nothing is drawn anew."""
     settings = settings_of("feed")

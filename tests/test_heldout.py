@@ -102,6 +102,10 @@ def test_protocol_pairs_all_strategies_on_pools_of_its_own(
         if setup == "feed":  # one name alone takes every offer
             assert (row[once][0].offered == row[once][0].asked).all()
             assert (row[rival][0].offered > row[rival][0].asked).any()
+        if setup == "query":
+            assert (row["greedy information, no repeats"][0].repeated == 0).all()
+            (fine,) = row["greedy information, M=40 (2 humans a pool)"]
+            assert fine.ess[:, 0].tolist() == [40.0, 40.0]
         # All start from the same prior samples of the same humans.
         start = row["RL"][0].alignment[:, 0]
         for name, results in row.items():

@@ -113,10 +113,12 @@ def test_table_has_a_row_for_each_update(tmp_path: Path) -> None:
         assert [float(text) for text in shown] == pytest.approx(numbers, rel=1e-5)
 
 
-@pytest.mark.parametrize("setup", ["query", "feed"])
-def test_what_is_measured_is_what_is_saved(setup: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("setup", "policy"), [("query", "scorer"), ("feed", "scorer"), ("feed", "attention")]
+)
+def test_what_is_measured_is_what_is_saved(setup: str, policy: str, tmp_path: Path) -> None:
     """The moving average of the weights, on the test pool, beside the strongest baseline."""
-    trainer, curve, settings, task = watched(1, setup, learning_rate=0.05, average=0.5)
+    trainer, curve, settings, task = watched(1, setup, policy, learning_rate=0.05, average=0.5)
     trainer.run(tmp_path, lambda: None, curve.measure)
     checkpoint = make_checkpoint(settings, task, trainer)
     seed = 2**32 - 1 - settings["evaluation"]["seed"]
@@ -128,12 +130,14 @@ def test_what_is_measured_is_what_is_saved(setup: str, tmp_path: Path) -> None:
         name, baseline = "greedy alignment", Greedy(task.response_model, alignment_gain)
     humans = draw_humans(env)
 
-    def alone(strategy: Any) -> Evaluation:
+    def alone(strategy: Any, sample: bool = False) -> Evaluation:
         env.set_seed(seed)
-        return evaluate(env, strategy, humans)
+        torch.manual_seed(seed)
+        return evaluate(env, strategy, humans, sample)
 
     progress = trainer.progress
-    end = alone(load_policy(checkpoint, env).strategy).alignment[:, -1]
+    sample = settings["policy"]["sample"]
+    end = alone(load_policy(checkpoint, env).strategy, sample).alignment[:, -1]
     assert torch.equal(progress.held_out[6], end)
     assert not torch.equal(progress.held_out[0], end)
     assert progress.baseline is not None

@@ -151,10 +151,9 @@ def test_held_out_humans_are_met_nowhere_else() -> None:
     _, _, watching = curve._made
     n_humans, seed = check_evaluation(settings)
     judged = draw_humans(make_feed_env(settings, task, task.test, n_humans, seed))
-    trained = trainer.collector._carrier
-    for others in (judged, trained):
-        near = torch.cdist(watching["human", "omega"], others["human", "omega"])
-        assert near.amin() > 1e-3
+    trained = trainer.state_dict()["sessions"]["human"]["omega"]
+    for others in (judged["human", "omega"], trained):
+        assert torch.cdist(watching["human", "omega"], others).amin() > 1e-3
 
 
 def test_an_index_is_judged_on_the_pool_that_it_belongs_to() -> None:

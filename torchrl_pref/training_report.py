@@ -6,7 +6,7 @@ Shapes: B held-out humans.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 
@@ -123,12 +123,7 @@ def _draw_level(axis: Axes, name: str, progress: Progress) -> None:
     color, _ = _style(name)
     axis.plot(updates, means, color=color, marker="o", zorder=3, label=f"{name}, as it learns")
     axis.fill_between(updates, low, high, color=color, alpha=0.15, lw=0)
-    others = {}
-    if progress.baseline is not None:
-        baseline, values = progress.baseline
-        others[NAMES.get(baseline, baseline)] = STYLE[baseline], values
-    others["the policy before training"] = START, alignments[0]
-    for label, ((color, line), values) in others.items():
+    for label, (color, line), values in _others(progress):
         axis.axhline(float(values.mean()), color=color, linestyle=line, label=label)
     axis.set_ylabel("alignment with held-out humans")
     _legend_above(axis)
@@ -137,12 +132,8 @@ def _draw_level(axis: Axes, name: str, progress: Progress) -> None:
 def _draw_gain(axis: Axes, name: str, progress: Progress) -> None:
     """Paired differences of the policy to its start and to the baseline, by update."""
     updates = sorted(progress.held_out)
-    others = {"the policy before training": (START[0], progress.held_out[updates[0]])}
-    if progress.baseline is not None:
-        baseline, values = progress.baseline
-        others[NAMES.get(baseline, baseline)] = (STYLE[baseline][0], values)
     apart = 0.006 * (updates[-1] - updates[0])  # side by side, or bars would hide each other
-    for side, (label, (color, other)) in zip((-apart, apart), others.items(), strict=False):
+    for side, (label, (color, _), other) in zip((apart, -apart), _others(progress), strict=False):
         gains = [progress.held_out[update] - other for update in updates]
         means = torch.stack([gain.mean() for gain in gains])
         bounds = torch.tensor([bootstrap_interval(gain) for gain in gains]).T
@@ -154,6 +145,14 @@ def _draw_gain(axis: Axes, name: str, progress: Progress) -> None:
     axis.axhline(0, color="#555555", lw=0.8)
     axis.set_ylabel("difference in alignment,\nhuman by human")
     _legend_above(axis)
+
+
+def _others(progress: Progress) -> Iterator[tuple[str, tuple[str, str], Tensor]]:
+    """What the policy is held against: its name, its style and its alignments (B)."""
+    if progress.baseline is not None:
+        name, values = progress.baseline
+        yield NAMES.get(name, name), STYLE.get(name, ("#000000", "-")), values
+    yield "the policy before training", START, progress.held_out[min(progress.held_out)]
 
 
 def _legend_above(axis: Axes) -> None:

@@ -233,6 +233,7 @@ BAD_INPUT = [
     ("train", "setup.on_skip=stay", "setup.on_skip='stay': expected one of new, repeat"),
     ("train", "training.updates=0", "training.updates=0: expected a whole number"),
     ("train", "evaluation.humans=1", "evaluation.humans=1: expected a whole number"),
+    ("train", "evaluation.during=-1", "evaluation.during=-1: expected a whole number"),
     ("train", "threads=0", "threads=0: expected a whole number"),
     ("train", "seed=-1", "seed=-1: expected a whole number"),
     ("train", "device=abacus", "device='abacus': expected cpu, cuda"),

@@ -26,6 +26,7 @@ from torchrl_pref.settings import check_evaluate_settings
 if TYPE_CHECKING:
     from torchrl_pref.checkpoint import Checkpoint
     from torchrl_pref.comparison import Panels
+    from torchrl_pref.progress import Progress
 
 PROTOCOL_KEYS = (
     "checkpoint",
@@ -88,7 +89,7 @@ def check(settings: dict[str, Any]) -> None:
 
 def evaluate(settings: dict[str, Any], folder: Path) -> None:
     """What the settings ask for, reported in a folder."""
-    from torchrl_pref import reports
+    from torchrl_pref import reports, training_report
 
     app.use_threads(settings)
     named = settings["checkpoint"]
@@ -96,12 +97,14 @@ def evaluate(settings: dict[str, Any], folder: Path) -> None:
         run_heldout(settings, folder)
     elif "policy" in settings:
         panels = evaluate_taus(settings, partial(pretrained_for, settings))
-        reports.write_report(folder, panels, {})
+        reports.write_report(folder, panels)
     elif named is None:
-        reports.write_report(folder, evaluate_taus(settings, lambda tau: {}), {})
+        reports.write_report(folder, evaluate_taus(settings, lambda tau: {}))
     else:
         paths = find_checkpoints([str(name) for name in listed(named)])
-        reports.write_report(folder, *evaluate_checkpoints(settings, paths))
+        panels, trained = evaluate_checkpoints(settings, paths)
+        reports.write_report(folder, panels)
+        training_report.write_training(folder, trained)
 
 
 def listed(value: Any) -> list[Any]:
@@ -176,9 +179,9 @@ def find_checkpoints(named: list[str]) -> list[Path]:
 
 def evaluate_checkpoints(
     settings: dict[str, Any], paths: list[Path]
-) -> tuple[Panels, dict[str, dict[str, list[float]]]]:
-    """Learned policies beside random and greedy, a panel for each kind of human, and the training
-    histories behind them."""
+) -> tuple[Panels, dict[str, Progress]]:
+    """Learned policies beside random and greedy, a panel for each kind of human, and the trainings
+    behind them."""
     from torchrl_pref import comparison, experiment
     from torchrl_pref.checkpoint import Checkpoint
     from torchrl_pref.queries import QueryPool
@@ -201,11 +204,11 @@ def evaluate_checkpoints(
             test = QueryPool.load(settings["pool"]["test"]).map_features(task.normalizer)
         panels |= comparison.evaluate_panels(panel_settings, task, learned, test)
     titles = [f"{comparison.label_of(c.settings)}, {task.title}" for _, c, task in runs]
-    histories = {}
+    trained = {}
     for title, (name, checkpoint, _) in zip(titles, runs, strict=True):
         unique = title if titles.count(title) == 1 else f"{title}, {name}"
-        histories[unique] = checkpoint.history
-    return panels, histories
+        trained[unique] = checkpoint.progress
+    return panels, trained
 
 
 if __name__ == "__main__":

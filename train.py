@@ -185,6 +185,8 @@ def go_on(folder: Path, new: dict[str, Any]) -> float:
 
     checkpoint = Checkpoint.load(folder) if (folder / CHECKPOINT).exists() else None
     settings = load_config(folder) if checkpoint is None else checkpoint.settings
+    if isinstance(settings.get("evaluation"), dict):
+        settings["evaluation"].setdefault("during", 0)  # version 0.1.0 knew no such key
     for key in ("device", "threads"):
         if typed.was_typed(key):
             settings[key] = new[key]
@@ -224,7 +226,8 @@ def check_trained(path: Path, checkpoint: Checkpoint) -> None:
 
 def train(folder: Path, settings: dict[str, Any], task: Task, trainer: Trainer) -> float:
     """Train, evaluate on the held-out pool, report."""
-    from torchrl_pref import comparison, experiment, reports
+    from torchrl_pref import comparison, experiment, reports, training_report
+    from torchrl_pref.learning_curve import LearningCurve
 
     setup = settings["setup"]["name"]
     print(f"{setup} setup, {task.title}, run folder {folder}")
@@ -232,11 +235,12 @@ def train(folder: Path, settings: dict[str, Any], task: Task, trainer: Trainer) 
     def save() -> None:
         experiment.make_checkpoint(settings, task, trainer).save(folder / CHECKPOINT)
 
-    trainer.run(folder, save)
+    trainer.run(folder, save, LearningCurve(settings, task, trainer).measure)
     label = comparison.label_of(settings)
     learned = {label: experiment.make_checkpoint(settings, task, trainer)}
     panels = comparison.evaluate_panels(settings, task, learned)
-    reports.write_report(folder, panels, {label: trainer.progress.history})
+    reports.write_report(folder, panels)
+    training_report.write_training(folder, {label: trainer.progress})
     held_out = next(iter(panels.values()))[label]
     return sweeps.write_summary(folder, settings["overrides"], held_out)
 

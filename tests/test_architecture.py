@@ -17,11 +17,13 @@ LAYERS = [
     {"strategies"},
     {"scorer", "attention"},
     {"policies"},
-    {"checkpoint", "evaluation", "training"},
+    {"evaluation"},
+    {"progress"},
+    {"checkpoint", "training"},
     {"experiment"},
     {"comparison", "pretrained"},
-    {"heldout", "reports"},
-    {"heldout_report", "sweeps"},
+    {"heldout", "learning_curve", "reports"},
+    {"heldout_report", "sweeps", "training_report"},
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 

@@ -262,6 +262,11 @@ def test_resampling_follows_the_weights(generator: Generator) -> None:
     log_weights = torch.tensor([[0.0, math.log(2), -math.inf, 0.0]]).expand(2000, 4)
     counts = systematic_resample(log_weights, generator).flatten().bincount(minlength=4) / 2000
     assert counts.tolist() == pytest.approx([1, 2, 0, 1], abs=0.05)
+    # Shares that are no whole numbers: whether a sample comes once more is up to the offset.
+    shares = torch.tensor([0.3, 0.7, 1.2, 1.8])
+    drawn = systematic_resample(shares.log().expand(20_000, 4), generator)
+    counts = drawn.flatten().bincount(minlength=4) / 20_000
+    assert counts.tolist() == pytest.approx(shares.tolist(), abs=0.02)
     assert float(kish_share(log_weights[0])) == pytest.approx(16 / (4 * 6))
     assert float(kish_share(torch.full((4,), -math.inf))) == 0
 

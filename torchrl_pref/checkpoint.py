@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchrl_pref.errors import InputError
 from torchrl_pref.features import Normalizer
+from torchrl_pref.progress import Progress
 from torchrl_pref.queries import QueryPool, load_safely, save_atomically
 from torchrl_pref.runs import CHECKPOINT
 
@@ -17,6 +18,11 @@ KIND = "torchrl_pref checkpoint"
 
 FORMAT = 4
 """Raised whenever a key of the settings or of the checkpoint changes its meaning or its name."""
+
+
+def picks_by_index(settings: dict[str, Any]) -> bool:
+    """Whether a policy of these settings picks an index of its training pool."""
+    return bool(settings["policy"]["name"] == "paper" and settings["setup"]["name"] == "query")
 
 
 @dataclass
@@ -49,16 +55,14 @@ class Checkpoint:
         return Normalizer(self.mean, self.std)
 
     @property
-    def history(self) -> dict[str, list[float]]:
-        """What was logged at each update, by metric name; NaN where no episode ended."""
-        return self.training["history"]
+    def progress(self) -> Progress:
+        """How the training went."""
+        return Progress.of(self.training)
 
     @property
     def picks_by_index(self) -> bool:
         """Whether the policy picks an index of its training pool, as the paper's query policy."""
-        return self.settings["policy"]["name"] == "paper" and (
-            self.settings["setup"]["name"] == "query"
-        )
+        return picks_by_index(self.settings)
 
     def save(self, path: str | Path) -> None:
         """Write the checkpoint, whole or not at all."""

@@ -69,9 +69,11 @@ def check_evaluation(settings: Settings) -> tuple[int, int]:
     """How many humans, and their seed; call it before a training whose result they will judge.
 
     Raises:
-        InputError: they are too few, or the seed is out of range.
+        InputError: they are too few, or the seed or the evaluations during training are out of
+            range.
     """
     section = settings["evaluation"]
+    check_count("evaluation.during", section.get("during", 0), 0)
     n_humans = check_count("evaluation.humans", section["humans"], 2)
     return n_humans, FIRST_EVALUATION_SEED + check_seed("evaluation.seed", section["seed"])
 

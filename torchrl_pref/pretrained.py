@@ -72,7 +72,7 @@ def export(sweep: str | Path) -> list[Path]:
     for path in sorted(Path(sweep).rglob(CHECKPOINT)):
         checkpoint = Checkpoint.load(path)
         settings = checkpoint.settings
-        checkpoint.training = {"history": checkpoint.history}
+        checkpoint.training = checkpoint.progress.state_dict()
         name = f"{settings['setup']['name']}-{settings['tau']}-{settings['seed']}.pt"
         checkpoint.save(FOLDER / name)
         written.append(FOLDER / name)

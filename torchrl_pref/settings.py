@@ -63,6 +63,7 @@ TASK: dict[str, Check] = {
 TRAINING: dict[str, Check] = {
     "tau": check_tau,
     "seed": check_seed,
+    "evaluation.during": count(0),
     "training.updates": count(1),
     "training.sessions": count(1),
     "training.steps": optional(count(1)),

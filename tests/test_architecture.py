@@ -9,7 +9,7 @@ PACKAGE = Path(torchrl_pref.__file__).parent
 
 LAYERS = [
     {"errors", "compiled"},
-    {"responses", "sampler_cpu"},
+    {"responses", "sampler_cpu", "scoring_cpu"},
     {"acquisition", "sampler"},
     {"belief", "features", "gridworld"},
     {"queries", "humans", "objectives"},

@@ -8,7 +8,7 @@ import torchrl_pref
 PACKAGE = Path(torchrl_pref.__file__).parent
 
 LAYERS = [
-    {"errors", "compiled"},
+    {"errors", "compiled", "per_belief"},
     {"responses", "sampler_cpu", "scoring_cpu"},
     {"acquisition", "sampler"},
     {"belief", "features", "gridworld"},
@@ -17,7 +17,8 @@ LAYERS = [
     {"strategies"},
     {"scorer", "attention"},
     {"policies"},
-    {"checkpoint", "evaluation", "training"},
+    {"checkpoint", "collection", "evaluation"},
+    {"training"},
     {"experiment"},
     {"comparison", "pretrained"},
     {"heldout", "reports"},

@@ -181,10 +181,13 @@ def score_in_tensors(
     return torch.cat(rows)
 
 
-def standardise(scores: Tensor, among: Tensor | None = None) -> Tensor:
-    """Scores (B C V) less a mean, in standard deviations: those of the C scores of each session,
-    or of other scores (B N V) that they are seen among."""
-    among = scores if among is None else among
-    mean = among.mean(-2, keepdim=True)
-    deviation = (among - mean).square().mean(-2, keepdim=True).sqrt()
-    return (scores - mean) / deviation.clamp(min=1e-6)
+def moments_among(scores: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation (B 1 V) of scores (B N V), the latter not below 10⁻⁶."""
+    mean = scores.mean(-2, keepdim=True)
+    return mean, (scores - mean).square().mean(-2, keepdim=True).sqrt().clamp(min=1e-6)
+
+
+def standardise(scores: Tensor) -> Tensor:
+    """Scores (B C V) less their mean over the C of each session, in standard deviations."""
+    mean, deviation = moments_among(scores)
+    return (scores - mean) / deviation

@@ -70,7 +70,7 @@ class Sessions:
         total = session["episode_reward"] + after["reward"]
         count = session["step_count"] + 1
         kept = {key: after[key] for key in ("reward", "done", "terminated", "n_asked")}
-        kept["metrics"] = {"alignment": after["metrics", "alignment"]}
+        kept["metrics"] = after["metrics"].select("alignment")
         record["next"] = TensorDict(
             {**kept, "episode_reward": total, "step_count": count}, self.env.batch_size
         )

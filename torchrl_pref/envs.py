@@ -191,6 +191,8 @@ class SessionEnv(EnvBase):
         state["terminated"] = terminated
         state["truncated"] = truncated & ~terminated
         state["done"] = terminated | truncated
+        for key in ("human", "history", "metrics"):
+            state[key] = TensorDict(state[key], self.batch_size, device=self.device)
         return TensorDict(state, self.batch_size, device=self.device)
 
     @abstractmethod

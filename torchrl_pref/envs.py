@@ -50,6 +50,10 @@ State: TypeAlias = TensorDict | dict[str, Any]
 """A state: a dictionary while a step makes it, as writing to a tensordict takes time."""
 
 
+NESTED = ("human", "history", "metrics")
+"""What of a state holds several tensors."""
+
+
 class SessionEnv(EnvBase):
     """What both environments share: a human, a belief, and what an answer does to it."""
 
@@ -154,34 +158,45 @@ class SessionEnv(EnvBase):
         What stays the same is shared with the state before: a skip costs next to nothing.
         """
         state = {key: before[key] for key in self._state_keys}
-        human, history, metrics = (dict(state[key]) for key in ("human", "history", "metrics"))
-        state |= {"human": human, "history": history, "metrics": metrics}
+        for key in NESTED:
+            state[key] = dict(state[key])
         who = asked.nonzero().squeeze(-1)
-        if len(who) == 0:
-            return state
-        turn, samples = state["n_asked"][who, 0], state["samples"][who]
-        queries, model = self.features[index[who]], self.belief.response_model
-        faced = {key: value[who] for key, value in human.items()}
-        answers = self.human.respond(queries, faced, turn)
+        if len(who) == len(asked):
+            _put(state, self._answer(state, index), None)
+        elif len(who):
+            _put(state, self._answer(_rows(state, who), index[who]), who)
+        return state
+
+    def _answer(self, session: dict[str, Any], index: Tensor) -> dict[str, Any]:
+        """What changes in sessions (B) that ask pool queries ``index`` (B)."""
+        human, history, metrics = (session[key] for key in NESTED)
+        queries, model = self.features[index], self.belief.response_model
+        turn, samples = session["n_asked"].squeeze(-1), session["samples"]
+        answers = self.human.respond(queries, human, turn)
         # On the CPU only as many turns as were taken are worth the work; -1 slots come last.
         taken = int(turn.max())
-        past, given = (history[key][who, :taken] for key in ("queries", "answers"))
+        past, given = (history[key][:, :taken] for key in ("queries", "answers"))
         earlier, newest = feature_gaps(self.features[past], given), feature_gaps(queries, answers)
-        update = self.belief.update(
-            samples, metrics["ess"][who, 0], earlier, newest, self.generator
-        )
-        mean, measured = _measure(update.samples, faced["omega"])
+        ess = metrics["ess"].squeeze(-1)
+        update = self.belief.update(samples, ess, earlier, newest, self.generator)
+        mean, measured = _measure(update.samples, human["omega"])
         gain = score_queries(samples, queries.unsqueeze(1), model, information_gain)
-        measured["information"] = metrics["information"][who] + gain
-        measured["ess"] = update.ess.unsqueeze(-1)
-        state["n_asked"] = state["n_asked"] + asked.unsqueeze(-1)
-        state["samples"] = state["samples"].index_copy(0, who, update.samples)
-        state["mean"] = state["mean"].index_copy(0, who, mean)
-        for key, value in measured.items():
-            metrics[key] = metrics[key].index_copy(0, who, value)
-        for key, new in (("queries", index[who]), ("answers", answers.where(update.used, -1))):
-            history[key] = history[key].index_put((who, turn), new)
-        return state
+        place = torch.arange(history["queries"].shape[1], device=turn.device) == turn.unsqueeze(-1)
+        used = torch.where(update.used, answers, -1)
+        return {
+            "samples": update.samples,
+            "mean": mean,
+            "n_asked": session["n_asked"] + 1,
+            "history": {
+                "queries": torch.where(place, index.unsqueeze(-1), history["queries"]),
+                "answers": torch.where(place, used.unsqueeze(-1), history["answers"]),
+            },
+            "metrics": {
+                **measured,
+                "information": metrics["information"] + gain,
+                "ess": update.ess.unsqueeze(-1),
+            },
+        }
 
     def _finish(
         self, state: dict[str, Any], reward: Tensor, truncated: Tensor, terminated: Tensor
@@ -191,7 +206,7 @@ class SessionEnv(EnvBase):
         state["terminated"] = terminated
         state["truncated"] = truncated & ~terminated
         state["done"] = terminated | truncated
-        for key in ("human", "history", "metrics"):
+        for key in NESTED:
             state[key] = TensorDict(state[key], self.batch_size, device=self.device)
         return TensorDict(state, self.batch_size, device=self.device)
 
@@ -392,6 +407,23 @@ class FeedEnv(SessionEnv):
             # Scarce offers are part of the task, and nothing is to come after the last.
             terminated = terminated | out_of_offers
         return self._finish(state, reward, out_of_offers, terminated)
+
+
+def _rows(state: dict[str, Any], who: Tensor) -> dict[str, Any]:
+    """The sessions ``who`` of a state."""
+    return {
+        key: _rows(value, who) if isinstance(value, dict) else value[who]
+        for key, value in state.items()
+    }
+
+
+def _put(state: dict[str, Any], changed: dict[str, Any], who: Tensor | None) -> None:
+    """Put what changed in sessions ``who``, or in all, into a state; no tensor is overwritten."""
+    for key, new in changed.items():
+        if isinstance(new, dict):
+            _put(state[key], new, who)
+        else:
+            state[key] = new if who is None else state[key].index_copy(0, who, new)
 
 
 def _measure(samples: Tensor, omega: Tensor) -> tuple[Tensor, dict[str, Tensor]]:

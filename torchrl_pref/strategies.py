@@ -249,12 +249,12 @@ class OfferRank:
         Returns:
             (B 1), from 1/2N to 1 + 1/2N for a sample of N.
         """
-        *scores, mean, deviation = self._reference(samples).split_with_sizes(self.sizes, -1)
+        standard, mean, deviation = self._reference(samples).split_with_sizes(self.sizes, -1)
         score = (self._score(samples, offer.unsqueeze(1)).mT - mean) / deviation
         weights = torch.stack([left, 1 - left], 1) if self.n_scores == 2 else left.new_ones(1, 1, 1)
         value = (weights * score).sum(1)
         # A thousandth of a standard deviation keeps a query from outranking itself by rounding.
-        above = value > (weights * scores[0]).sum(1) + 1e-3
+        above = value > (weights * standard).sum(1) + 1e-3
         return (above.sum(1, keepdim=True) + 0.5) / len(self.reference)
 
     def _score_reference(self, samples: Tensor) -> Tensor:

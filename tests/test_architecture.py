@@ -8,8 +8,8 @@ import torchrl_pref
 PACKAGE = Path(torchrl_pref.__file__).parent
 
 LAYERS = [
-    {"errors", "compiled", "writing"},
-    {"checks", "memory", "responses", "runs", "sampler_cpu"},
+    {"errors", "compiled", "per_belief", "writing"},
+    {"checks", "memory", "responses", "runs", "sampler_cpu", "scoring_cpu"},
     {"acquisition", "sampler", "settings"},
     {"belief", "features", "gridworld"},
     {"queries", "humans", "objectives"},
@@ -17,7 +17,7 @@ LAYERS = [
     {"strategies"},
     {"scorer", "attention"},
     {"policies"},
-    {"evaluation"},
+    {"collection", "evaluation"},
     {"progress"},
     {"checkpoint", "training"},
     {"experiment"},

@@ -1,4 +1,4 @@
-"""Advantage actor-critic (A2C) on either environment, with TorchRL's collector, GAE and loss.
+"""Advantage actor-critic (A2C) on either environment, with TorchRL's GAE and loss.
 
 Shapes: B sessions side by side, T steps of each in a batch.
 """
@@ -19,13 +19,12 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
-from torchrl.collectors import Collector
-from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
 from torchrl.objectives import A2CLoss
 from torchrl.objectives.value import GAE
 from torchrl.record.loggers import get_logger
 from tqdm import tqdm
 
+from torchrl_pref.collection import Sessions
 from torchrl_pref.envs import FeedEnv, QueryEnv
 from torchrl_pref.errors import check_choice, check_count, check_positive, check_share
 from torchrl_pref.policies import Policy
@@ -116,12 +115,12 @@ class Trainer:
         self.advantage = GAE(
             gamma=settings.gamma,
             lmbda=settings.lmbda,
-            value_network=policy.critic,
+            value_network=None,  # the values come with the batch
             vectorized=False,
         )
         self.loss = A2CLoss(
             actor_network=policy.actor,
-            critic_network=policy.critic,
+            critic_network=policy.value,
             entropy_coeff=settings.entropy,
             critic_coeff=settings.critic,
             loss_critic_type="l2",
@@ -134,15 +133,7 @@ class Trainer:
                 self.loss.parameters(), settings.learning_rate, alpha=0.99, eps=1e-5
             )
         self.frames = settings.sessions * (settings.steps or env.max_steps)
-        transforms = Compose(RewardSum(), StepCounter())
-        self.collector = Collector(
-            TransformedEnv(env, transforms),
-            policy.strategy,
-            frames_per_batch=self.frames,
-            total_frames=-1,
-            track_traj_ids=False,
-            auto_register_policy_transforms=False,
-        )
+        self.sessions = Sessions(env, policy, settings.steps or env.max_steps)
 
     def run(
         self, folder: Path, save: Callable[[], None], measure: Callable[[], None] = lambda: None
@@ -167,10 +158,9 @@ class Trainer:
         with bar, _stop_request() as stopped:
             measure()
             start_table(table, progress, self.frames)
-            batches = iter(self.collector)
             while progress.update < settings.updates and not stopped():
                 start = time.perf_counter()
-                batch = next(batches)
+                batch = self.sessions.collect()
                 self.update(batch)
                 progress.update += 1
                 metrics = _episode_metrics(batch)
@@ -207,7 +197,7 @@ class Trainer:
     def _fit_critic(self, flat: TensorDictBase) -> None:
         """Bring the critic nearer to the returns of a batch (BT), in one pass over it."""
         if self.settings.critic_steps:
-            shown = flat.select(*self.policy.critic.in_keys, "value_target")
+            shown = flat.select(*self.policy.value.in_keys, "value_target")
             for part in torch.randperm(len(shown)).chunk(self.settings.critic_steps):
                 self._descend(self.loss.loss_critic(shown[part])[0].mean())
 
@@ -225,12 +215,11 @@ class Trainer:
 
     def state_dict(self) -> dict[str, Any]:
         """Plain data and tensors that :meth:`load_state_dict` goes on from, bit for bit."""
-        # TorchRL's collector state holds no environment state; ours is all in its carrier.
         return {
             **self.progress.state_dict(),
             "weights": self.policy.weights.state_dict(),
             "optimizer": self.optimizer.state_dict(),
-            "sessions": self.collector._carrier.to_dict(),
+            "sessions": self.sessions.now.to_dict(),
             "env_generator": self.env.generator.get_state(),
             "global_generator": torch.get_rng_state(),
         }
@@ -241,8 +230,8 @@ class Trainer:
         self.policy.weights.load_state_dict(state["weights"])
         self.progress = Progress.of(state)
         self.optimizer.load_state_dict(state["optimizer"])
-        sessions = TensorDict(state["sessions"], self.env.batch_size, device=self.env.device)
-        self.collector._carrier.update(sessions)
+        now = TensorDict(state["sessions"], self.env.batch_size, device=self.env.device)
+        self.sessions.now.update(now)
         self.env.generator.set_state(state["env_generator"])
         torch.set_rng_state(state["global_generator"])
 

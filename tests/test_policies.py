@@ -25,7 +25,6 @@ from torchrl_pref.responses import ResponseModel
 from torchrl_pref.scorer import (
     FEED_SCALE,
     PATIENCE_SCALE,
-    BeliefFeatures,
     CandidateFeatures,
     OfferScorer,
 )
@@ -219,10 +218,13 @@ def test_belief_is_summed_up_by_its_length_and_its_widths(
     turn = torch.linalg.qr(torch.randn(n_features, n_features, generator=generator)).Q
     mean = torch.linspace(0.1, 0.4, n_features)
     samples = mean + (cross * (n_features * variances).sqrt()) @ turn
-    remaining = torch.tensor([[0.3, 0.7]])
-    found = BeliefFeatures()(samples.unsqueeze(0), remaining)[0]
+    env = make(QueryEnv, QueryPool(torch.randn(9, 2, n_features, generator=generator)))
+    session = session_of(env)
+    session["samples"] = samples.repeat(4, 1, 1)
+    session["remaining"] = torch.full((4, 1), 0.3)
+    found = scorer_policy(env).strategy(session)["belief_features"][2]
     widths = torch.stack([variances.max(), variances.mean(), variances.min()]).log() / 4
-    expected = torch.cat([remaining[0], mean.norm().unsqueeze(0), widths])
+    expected = torch.cat([torch.tensor([0.3]), mean.norm().unsqueeze(0), widths])
     assert torch.allclose(found, expected, atol=1e-4)
 
 

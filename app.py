@@ -5,102 +5,216 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import shlex
+import shutil
+import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from types import FrameType
+from typing import Any, TextIO
 
-import torch
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
+from hydra.experimental.callback import Callback
+from hydra.types import RunMode
+from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from torchrl_pref.errors import InputError, check_count, one_line_errors
+import typed
+from torchrl_pref import runs, sweeps
+from torchrl_pref.errors import InputError, one_line_errors
 
-SECTIONS = {"grid", "pool", "belief", "evaluation", "training", "setup", "policy"}
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM, which stops a program as Ctrl-C does."""
 
 
-def main(job: Callable[[], Any]) -> None:
-    """Run a Hydra job; input that cannot be used ends it with one line and status 2."""
+def main(job: Callable[[], Any], check: Callable[[dict[str, Any]], None]) -> None:
+    """Run a Hydra job; input that cannot be used ends it with one line and status 2.
+
+    Args:
+        job: as decorated by Hydra.
+        check: raises an InputError for settings that the job cannot use; it is called before
+            anything is made for them.
+    """
     # Without this Hydra prints its own several lines and exits with status 1.
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    with one_line_errors():
+    # Python puts a script's folder on the path of the script alone; a launcher's workers need it.
+    path = [str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])]
+    os.environ["PYTHONPATH"] = os.pathsep.join(path)
+    signal.signal(signal.SIGTERM, _terminate)
+    typed.Gate.check, typed.Gate.passed, typed.Gate.made = check, False, ()
+    with unbroken_output(), one_line_errors():
         try:
-            job()
-        except (HydraException, OmegaConfBaseException) as error:
-            text = " ".join(str(error).split())
-            text = re.sub(
-                r"\.? (Config search path:|full_key:|To append to your config).*", "", text
-            )
-            raise InputError(f"{text}; --help lists the keys and their values") from None
-        except KeyboardInterrupt:
+            with typed.refusals(), typed.checked_flags(), sweep_report():
+                job()
+        except KeyboardInterrupt as stop:
             print("\nstopped", file=sys.stderr)
-            raise SystemExit(130) from None
+            raise SystemExit(exit_status(stop)) from None
         except OSError as error:
             raise InputError(
                 f"{error.filename}: the run folder cannot be written ({error.strerror}); "
                 "set hydra.run.dir to a folder that can be"
             ) from None
+        finally:
+            typed.discard_folders()
 
 
-def plain_settings(config: DictConfig) -> dict[str, Any]:
-    """The composed configuration as plain values.
+def _terminate(number: int, frame: FrameType | None) -> None:
+    raise Terminated
 
-    Raises:
-        InputError: a section was replaced by a value, or a group was renamed from within.
-    """
-    settings = OmegaConf.to_container(config, resolve=True)
-    assert isinstance(settings, dict)
-    choices = HydraConfig.get().runtime.choices
-    for section in SECTIONS & set(settings):
-        if not isinstance(settings[section], dict):
-            raise InputError(
-                f"{section}={settings[section]!r}: {section} is a section of keys and not a value; "
-                f"type {section}.<key>=<value>, --help lists them"
-            )
-    for group in ("setup", "policy"):
-        chosen = choices.get(group)
-        if chosen is not None and settings[group]["name"] != chosen:
-            name = settings[group]["name"]
-            raise InputError(
-                f"{group}.name={name!r}: type {group}={name} to choose another {group}"
-            )
-    return {str(key): value for key, value in settings.items()}
+
+def exit_status(stop: KeyboardInterrupt) -> int:
+    """The status with which a shell tells of the signal."""
+    return 128 + (signal.SIGTERM if isinstance(stop, Terminated) else signal.SIGINT)
+
+
+@contextlib.contextmanager
+def unbroken_output() -> Iterator[None]:
+    """Go on where nobody reads what is printed any more, as after ``| head``."""
+    with (
+        contextlib.redirect_stdout(_Unbroken(sys.stdout)),
+        contextlib.redirect_stderr(_Unbroken(sys.stderr)),
+    ):
+        yield
+
+
+class _Unbroken:
+    """A stream that turns into the null device when its reader goes."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        """Write a text, flushed, so that a reader that has gone is noticed here."""
+        try:
+            written = self._stream.write(text)
+            self._stream.flush()
+        except BrokenPipeError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
+            written = len(text)
+        return written
 
 
 def use_threads(settings: dict[str, Any]) -> None:
     """Set torch to the number of threads in the settings."""
-    torch.set_num_threads(check_count("threads", settings["threads"], 1))
+    import torch
+
+    torch.set_num_threads(settings["threads"])
 
 
-def typed_overrides() -> list[str]:
-    """The keys=values that the user typed."""
-    return list(HydraConfig.get().overrides.task)
+def command(*arguments: str) -> str:
+    """A line for the shell that runs this script, with this Python, as from where it was run."""
+    python = "python" if shutil.which("python") == sys.executable else sys.executable
+    return shlex.join([python, sys.argv[0], *arguments])
 
 
-def was_typed(key: str) -> bool:
-    """Whether the user typed a value for a key."""
-    return any(override.split("=")[0].lstrip("+") == key for override in typed_overrides())
+def as_typed(key: str, folder: Path) -> str:
+    """``key=folder`` as Hydra is to be told it."""
+    text = str(folder)
+    if not re.fullmatch(r"[\w./-]*/[\w./-]*", text, re.ASCII):
+        text = re.sub(r"(\\*)\$\{", r"\1\1\\${", text)  # no interpolation
+        text = QuotedString(text, Quote.double).with_quotes()
+    return f"{key}={text}"
 
 
-def refuse_other_overrides(source: str, allowed: tuple[str, ...]) -> None:
-    """Refuse to ignore what the user typed where a checkpoint decides.
+def in_sweep() -> bool:
+    """Whether this job is one of a sweep."""
+    return bool(HydraConfig.get().mode == RunMode.MULTIRUN)
 
-    Args:
-        source: the key that names the checkpoint.
-        allowed: keys, or sections ending in a dot, that may be typed beside it.
+
+class Sweep(Callback):
+    """Claims a sweep's folder before its first job, in the process that the user started."""
+
+    folder: Path | None = None
+    claim = contextlib.ExitStack()
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Refuse to mix two sweeps; begin the table."""
+        folder = Path(os.path.abspath(config.hydra.sweep.dir))
+        with one_line_errors():
+            folder.mkdir(parents=True, exist_ok=True)
+            Sweep.claim.enter_context(runs.claimed(folder))
+            sweeps.write_table(folder)
+        Sweep.folder = folder
+
+
+@contextlib.contextmanager
+def sweep_report() -> Iterator[None]:
+    """At the end of a sweep, whatever ended it: its table, and what runs the missing jobs.
 
     Raises:
-        InputError: another key was typed.
+        InputError: the launcher gave up, or a job failed.
     """
-    for override in typed_overrides():
-        key = override.split("=")[0].lstrip("+~")
-        if key != source and not key.startswith(allowed):
+    with Sweep.claim:
+        try:
+            yield
+        except (KeyboardInterrupt, SystemExit):
+            if Sweep.folder is not None:
+                _report(Sweep.folder)
+                print(f"go on with: {_sweep_again(Sweep.folder)}")
+            raise
+        except Exception as error:
+            if Sweep.folder is None or isinstance(error, (HydraException, OmegaConfBaseException)):
+                raise
+            _report(Sweep.folder)
             raise InputError(
-                f"{override}: {source}=… brings its own settings and only "
-                f"{', '.join(allowed)} may be typed beside it; remove {key}, or drop {source}"
-            )
+                f"the launcher gave up ({type(error).__name__}: {error}); run what is missing "
+                f"with: {_sweep_again(Sweep.folder)}"
+            ) from error
+        if Sweep.folder is not None:
+            failed = _report(Sweep.folder)
+            if failed:
+                raise InputError(
+                    f"{', '.join(failed)}: failed, the table says why; once that is mended run "
+                    f"what is missing with: {_sweep_again(Sweep.folder)}"
+                )
+
+
+def _report(sweep: Path) -> list[str]:
+    """Write and print a sweep's table; returns the jobs that failed."""
+    rows = sweeps.write_table(sweep)
+    sweeps.show_table(sweep, rows)
+    return [f"job {row['job']}" for row in rows if row.get("failed")]
+
+
+def _sweep_again(sweep: Path) -> str:
+    """The command of this sweep, for the same folder."""
+    arguments = [a for a in sys.argv[1:] if not a.startswith("hydra.sweep.dir=")]
+    return command(*arguments, as_typed("hydra.sweep.dir", sweep))
+
+
+def do_job(work: Callable[[Path], float]) -> float:
+    """Do a job in the folder that Hydra made for it; in a sweep others go on where it fails.
+
+    Args:
+        work: what is done, in that folder.
+    """
+    folder = output_folder()
+    try:
+        with unbroken_output(), one_line_errors():
+            if in_sweep():
+                sweep = Path(os.path.abspath(HydraConfig.get().sweep.dir))
+                return sweeps.attempt(sweep, folder, typed.typed_overrides(), lambda: work(folder))
+            return work(folder)
+    finally:
+        discard_if_empty(folder)
+
+
+@contextlib.contextmanager
+def resumable(folder: Path) -> Iterator[None]:
+    """Where Ctrl-C or SIGTERM ends a run, say how to go on with it."""
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        if not in_sweep():
+            print(f"\nstopped; go on with: {command(as_typed('resume', folder))}")
+        raise SystemExit(exit_status(stop)) from None
 
 
 def output_folder() -> Path:
@@ -109,15 +223,14 @@ def output_folder() -> Path:
 
 
 def discard_if_empty(folder: Path) -> None:
-    """Remove a default folder that the job left empty, and the dated ones around it.
+    """Remove the default folder of a sweep's job that left it empty, and the dated ones around it.
 
     A folder that the user named is theirs, and stays.
     """
-    try:
-        inside = folder.relative_to(Path.cwd())
-    except ValueError:
+    if not in_sweep() or not folder.is_relative_to(Path.cwd()):
         return
-    if inside.parts[0] in ("outputs", "multirun"):
+    inside = folder.relative_to(Path.cwd())
+    if inside.parts[:1] in (("outputs",), ("multirun",)):
         with contextlib.suppress(OSError):
             for path in (inside, *list(inside.parents)[:-1]):
                 path.rmdir()

@@ -1,83 +1,204 @@
 """Train a policy to ask, then compare it with random and greedy on queries it never saw.
 
-`python train.py --help` lists the keys.
+`python train.py --help` lists the keys. What takes long to import is imported where it is used, so
+that help and refusals come at once.
 """
 
 from __future__ import annotations
 
-import shlex
-import sys
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import hydra
 from omegaconf import DictConfig, OmegaConf
 
 import app
-from torchrl_pref import comparison, experiment, reports
-from torchrl_pref.checkpoint import FILE_NAME, Checkpoint
-from torchrl_pref.errors import InputError, one_line_errors
-from torchrl_pref.training import Trainer
+import typed
+from torchrl_pref import runs, sweeps
+from torchrl_pref.errors import InputError
+from torchrl_pref.memory import check_memory
+from torchrl_pref.runs import CHECKPOINT
+from torchrl_pref.settings import check_run, check_train_settings
+from torchrl_pref.writing import write_text
 
+if TYPE_CHECKING:
+    from torchrl_pref.checkpoint import Checkpoint
+    from torchrl_pref.experiment import Task
+    from torchrl_pref.training import Trainer
+
+CONFIG = "config.yaml"
 POOLS = ("train_pool.pt", "test_pool.pt")
+RUN = (CHECKPOINT, *POOLS, CONFIG)
+"""The files by which a folder holds a run. The configuration comes first: from it the run can be
+started again where it was killed before its first checkpoint."""
 
 
 @hydra.main(config_path="conf", config_name="train", version_base="1.3")
 def job(config: DictConfig) -> float:
     """One run; returns the policy's final alignment on the test pool, for sweepers."""
-    made = app.output_folder()
-    try:
-        with one_line_errors():
-            settings = app.plain_settings(config)
-            resume, start = settings.pop("resume"), settings.pop("checkpoint")
-            if resume is not None:
-                allowed = ("training.updates", "device", "threads", "hydra.")
-                app.refuse_other_overrides("resume", allowed)
-                return go_on(Path(str(resume)), settings)
-            return begin(made, settings, None if start is None else str(start))
-    finally:
-        app.discard_if_empty(made)
+    return app.do_job(partial(run, config))
 
 
-def begin(folder: Path, settings: dict[str, Any], start: str | None) -> float:
-    """A new run in a folder."""
-    app.use_threads(settings)
-    settings["overrides"] = app.typed_overrides()
-    for name in (FILE_NAME, *POOLS):
-        if (folder / name).exists():
+def check(settings: dict[str, Any]) -> None:
+    """Refuse what cannot be trained.
+
+    Raises:
+        InputError: a setting is out of range, or was typed where a checkpoint decides.
+    """
+    check_train_settings(settings)
+    if settings["resume"] is not None:
+        allowed = ("training.updates", "device", "threads", "hydra.")
+        typed.refuse_other_overrides("resume", allowed)
+
+
+def run(config: DictConfig, made: Path) -> float:
+    """A new run in the folder made for it, or one to go on with, in its own."""
+    settings = typed.plain_settings(config)
+    check(settings)
+    resume = settings.pop("resume")
+    if resume is not None:
+        folder = run_folder(Path(str(resume)))
+        with runs.claimed(folder):
+            value = go_on(folder, settings)
+        if (folder.parent / sweeps.TABLE).exists():
+            sweeps.show_table(folder.parent, sweeps.write_table(folder.parent))
+        return value
+    with runs.claimed(made):
+        if not any((made / name).exists() for name in RUN):
+            return begin(made, settings)
+        if not app.in_sweep():
             raise InputError(
-                f"{folder} holds a run already ({name}); go on with it by resume={folder}, or name "
-                "another folder by hydra.run.dir="
+                f"{made} holds a run already; go on with it by: "
+                f"{app.command(app.as_typed('resume', made))}, or name another folder by "
+                "hydra.run.dir="
             )
+        refuse_other_run(made, settings)
+        if (made / sweeps.SUMMARY).exists():
+            print(f"{made}: this job is finished")
+            return sweeps.final_alignment(made)
+        return go_on(made, settings)
+
+
+def run_folder(path: Path) -> Path:
+    """The folder of a run, named by itself or by its checkpoint.
+
+    Raises:
+        InputError: there is none.
+    """
+    from torchrl_pref.checkpoint import Checkpoint
+
+    if path.is_file():
+        check_trained(path, Checkpoint.load(path))
+        path = path.parent
+    if not any((path / name).exists() for name in (CHECKPOINT, CONFIG)):
+        found = "holds no run" if path.is_dir() else "no such file or folder"
+        raise InputError(
+            f"resume={path}: {found}; expected the folder of a run, with its {CHECKPOINT} or "
+            f"{CONFIG}; check the path, or start a new run there by hydra.run.dir="
+        )
+    return path.resolve()
+
+
+def refuse_other_run(folder: Path, settings: dict[str, Any]) -> None:
+    """Refuse to go on with a run that has other settings.
+
+    Raises:
+        InputError: it has.
+    """
+    asked = flat({**settings, "overrides": None})
+    there = flat({**load_config(folder), "overrides": None})
+    differing = [
+        f"{key}={there.get(key)} there and {asked.get(key)} here"
+        for key in sorted(asked.keys() | there.keys())
+        if asked.get(key) != there.get(key) and key not in ("device", "threads")
+    ]
+    if differing:
+        raise InputError(
+            f"{folder} holds a run with other settings ({', '.join(differing)}); name another "
+            "folder by hydra.sweep.dir=, or type the settings of that sweep"
+        )
+
+
+def flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings by their dotted keys."""
+    found: dict[str, Any] = {}
+    for key, value in settings.items():
+        found |= (
+            flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+        )
+    return found
+
+
+def load_config(folder: Path) -> dict[str, Any]:
+    """The configuration that a run was started with.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    try:
+        settings = OmegaConf.to_container(OmegaConf.load(folder / CONFIG))
+    except Exception as error:  # whatever the reader trips over, the file is at fault
+        raise InputError(f"{folder / CONFIG}: cannot be read ({error}); restore it") from error
+    if not isinstance(settings, dict):
+        raise InputError(f"{folder / CONFIG}: holds no settings; restore it")
+    return {str(key): value for key, value in settings.items()}
+
+
+def begin(folder: Path, settings: dict[str, Any]) -> float:
+    """A new run in a folder, from the settings as typed."""
+    settings["overrides"] = typed.typed_overrides()
+    if settings["checkpoint"] is not None:
+        settings["checkpoint"] = str(Path(str(settings["checkpoint"])).absolute())
+    return start(folder, settings)
+
+
+def start(folder: Path, settings: dict[str, Any]) -> float:
+    """The first update of a run, and all that follow."""
+    from torchrl_pref import comparison, experiment
+    from torchrl_pref.checkpoint import Checkpoint
+
+    app.use_threads(settings)
     pools = experiment.make_pools(settings)
+    check_memory(settings, *pools[0].features.shape)
     task = experiment.make_task(*pools, settings["tau"])
     trainer = experiment.make_trainer(settings, task)
     comparison.check_evaluation(settings)
-    if start is not None:
-        checkpoint = Checkpoint.load(start)
+    source = settings["checkpoint"]
+    if source is not None:
+        checkpoint = Checkpoint.load(source)
         checkpoint.check_fits(task.train, own_indices=True)
         experiment.load_weights(trainer.policy, checkpoint)
         trainer.start_average()
-    for pool, name in zip(pools, POOLS, strict=True):
-        pool.save(folder / name)
-    OmegaConf.save(settings, folder / "config.yaml")
-    return train(folder, settings, task, trainer)
+    with app.resumable(folder):
+        write_text(folder / CONFIG, OmegaConf.to_yaml(OmegaConf.create(settings)))
+        for pool, name in zip(pools, POOLS, strict=True):
+            pool.save(folder / name)
+        del settings["checkpoint"]  # no more than where the weights began
+        return train(folder, settings, task, trainer)
 
 
-def go_on(folder: Path, typed: dict[str, Any]) -> float:
-    """An old run, from its last checkpoint, with its own settings."""
-    checkpoint = Checkpoint.load(folder)
-    if "optimizer" not in checkpoint.training:
-        raise InputError(
-            f"resume={folder}: holds a policy without the state of its training; start a new run "
-            f"from it by checkpoint={folder}"
-        )
-    settings = checkpoint.settings
+def go_on(folder: Path, new: dict[str, Any]) -> float:
+    """An old run, from its last checkpoint or its start, with its own settings."""
+    from torchrl_pref import experiment
+    from torchrl_pref.checkpoint import Checkpoint
+
+    checkpoint = Checkpoint.load(folder) if (folder / CHECKPOINT).exists() else None
+    settings = load_config(folder) if checkpoint is None else checkpoint.settings
+    if isinstance(settings.get("evaluation"), dict):
+        settings["evaluation"].setdefault("during", 0)  # version 0.1.0 knew no such key
     for key in ("device", "threads"):
-        if app.was_typed(key):
-            settings[key] = typed[key]
-    if app.was_typed("training.updates"):
-        settings["training"]["updates"] = typed["training"]["updates"]
+        if typed.was_typed(key):
+            settings[key] = new[key]
+    if typed.was_typed("training.updates"):
+        updates = settings["training"]["updates"] = new["training"]["updates"]
+        others = [o for o in settings["overrides"] if not o.startswith("training.updates=")]
+        settings["overrides"] = [*others, f"training.updates={updates}"]
+    check_run(settings)
+    if checkpoint is None:
+        print(f"{folder}: was stopped before its first checkpoint and starts again")
+        return start(folder, settings)
+    check_trained(folder, checkpoint)
     app.use_threads(settings)
     task = experiment.reload_task(checkpoint, *(folder / name for name in POOLS))
     trainer = experiment.make_trainer(settings, task)
@@ -86,35 +207,43 @@ def go_on(folder: Path, typed: dict[str, Any]) -> float:
     done, updates = trainer.progress.update, settings["training"]["updates"]
     if done >= updates:
         print(f"{done} updates are done; train further with training.updates={2 * done}")
-    return train(folder, settings, task, trainer)
+    with app.resumable(folder):
+        return train(folder, settings, task, trainer)
 
 
-def train(folder: Path, settings: dict[str, Any], task: experiment.Task, trainer: Trainer) -> float:
+def check_trained(path: Path, checkpoint: Checkpoint) -> None:
+    """Refuse a policy that cannot be trained further.
+
+    Raises:
+        InputError: its file lacks the state of its training.
+    """
+    if "optimizer" not in checkpoint.training:
+        raise InputError(
+            f"resume={path}: holds a policy without the state of its training; start a new run "
+            f"from it by checkpoint={path}"
+        )
+
+
+def train(folder: Path, settings: dict[str, Any], task: Task, trainer: Trainer) -> float:
     """Train, evaluate on the held-out pool, report."""
+    from torchrl_pref import comparison, experiment, reports, training_report
+    from torchrl_pref.learning_curve import LearningCurve
+
     setup = settings["setup"]["name"]
     print(f"{setup} setup, {task.title}, run folder {folder}")
 
     def save() -> None:
-        experiment.make_checkpoint(settings, task, trainer).save(folder / FILE_NAME)
+        experiment.make_checkpoint(settings, task, trainer).save(folder / CHECKPOINT)
 
-    go_on_line = f"go on with: python train.py resume={shlex.quote(str(folder))}"
-    if not trainer.run(folder, save):
-        print(f"stopped after {trainer.progress.update} updates; {go_on_line}")
-        sys.exit(130)
+    trainer.run(folder, save, LearningCurve(settings, task, trainer).measure)
     label = comparison.label_of(settings)
     learned = {label: experiment.make_checkpoint(settings, task, trainer)}
-    try:
-        panels = comparison.evaluate_panels(settings, task, learned)
-    except KeyboardInterrupt:
-        print(f"\ntrained, not evaluated; {go_on_line}")
-        sys.exit(130)
-    reports.write_report(folder, panels, {label: trainer.progress.history})
+    panels = comparison.evaluate_panels(settings, task, learned)
+    reports.write_report(folder, panels)
+    training_report.write_training(folder, {label: trainer.progress})
     held_out = next(iter(panels.values()))[label]
-    reports.write_summary(folder, settings["overrides"], held_out)
-    if (folder.parent / "multirun.yaml").exists():  # Hydra's mark of a sweep
-        print(reports.sweep_table(folder.parent))
-    return float(held_out.alignment[:, -1].mean())
+    return sweeps.write_summary(folder, settings["overrides"], held_out)
 
 
 if __name__ == "__main__":
-    app.main(job)
+    app.main(job, check)

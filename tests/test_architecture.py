@@ -8,9 +8,9 @@ import torchrl_pref
 PACKAGE = Path(torchrl_pref.__file__).parent
 
 LAYERS = [
-    {"errors", "compiled"},
-    {"responses", "sampler_cpu"},
-    {"acquisition", "resampling_cpu"},
+    {"errors", "compiled", "per_belief", "writing"},
+    {"checks", "memory", "responses", "runs", "sampler_cpu", "scoring_cpu"},
+    {"acquisition", "resampling_cpu", "settings"},
     {"resampling"},
     {"sampler", "features"},
     {"belief", "gridworld"},
@@ -19,11 +19,13 @@ LAYERS = [
     {"strategies"},
     {"scorer", "attention"},
     {"policies"},
-    {"checkpoint", "evaluation", "training"},
+    {"collection", "evaluation"},
+    {"progress"},
+    {"checkpoint", "training"},
     {"experiment"},
     {"comparison", "pretrained"},
-    {"heldout", "reports"},
-    {"heldout_report"},
+    {"heldout", "learning_curve", "reports"},
+    {"heldout_report", "sweeps", "training_report"},
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 

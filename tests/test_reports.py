@@ -12,13 +12,11 @@ from torchrl_pref.evaluation import draw_humans, evaluate
 from torchrl_pref.queries import QueryPool
 from torchrl_pref.reports import (
     alignment_table,
-    even_edges,
-    geometric_edges,
     milestones,
-    smoothed,
     write_curves,
 )
 from torchrl_pref.strategies import Greedy, RandomQuery
+from torchrl_pref.training_report import even_edges, geometric_edges, smoothed
 
 
 @pytest.mark.parametrize("edges_of", [even_edges, geometric_edges])

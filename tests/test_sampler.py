@@ -98,6 +98,12 @@ def test_resampling_follows_the_weights(draw: object, generator: Generator) -> N
     assert copies.mean(0).sum(0).tolist() == pytest.approx([1, 2, 0, 1], abs=0.05)
     assert (factor >= 1).all()
     assert (factor <= 2).all()
+    # Shares that are no whole numbers: whether a sample comes once more is up to the offset.
+    shares = torch.tensor([0.3, 0.7, 1.2, 1.8])
+    offset = torch.rand(20_000, generator=generator)
+    many = samples[:1].expand(20_000, 4, 4)
+    copies, _ = draw(many, shares.log().expand(20_000, 4), offset)  # type: ignore[operator]
+    assert copies.mean(0).sum(0).tolist() == pytest.approx(shares.tolist(), abs=0.02)
     assert float(kish_share(log_weights[0])) == pytest.approx(16 / (4 * 6))
     assert float(kish_share(torch.full((4,), -math.inf))) == 0
 

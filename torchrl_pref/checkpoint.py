@@ -10,13 +10,19 @@ from torch import Tensor
 
 from torchrl_pref.errors import InputError
 from torchrl_pref.features import Normalizer
+from torchrl_pref.progress import Progress
 from torchrl_pref.queries import QueryPool, load_safely, save_atomically
+from torchrl_pref.runs import CHECKPOINT
 
 KIND = "torchrl_pref checkpoint"
-FILE_NAME = "checkpoint.pt"
 
 FORMAT = 4
 """Raised whenever a key of the settings or of the checkpoint changes its meaning or its name."""
+
+
+def picks_by_index(settings: dict[str, Any]) -> bool:
+    """Whether a policy of these settings picks an index of its training pool."""
+    return bool(settings["policy"]["name"] == "paper" and settings["setup"]["name"] == "query")
 
 
 @dataclass
@@ -49,16 +55,14 @@ class Checkpoint:
         return Normalizer(self.mean, self.std)
 
     @property
-    def history(self) -> dict[str, list[float]]:
-        """What was logged at each update, by metric name; NaN where no episode ended."""
-        return self.training["history"]
+    def progress(self) -> Progress:
+        """How the training went."""
+        return Progress.of(self.training)
 
     @property
     def picks_by_index(self) -> bool:
         """Whether the policy picks an index of its training pool, as the paper's query policy."""
-        return self.settings["policy"]["name"] == "paper" and (
-            self.settings["setup"]["name"] == "query"
-        )
+        return picks_by_index(self.settings)
 
     def save(self, path: str | Path) -> None:
         """Write the checkpoint, whole or not at all."""
@@ -72,7 +76,7 @@ class Checkpoint:
             InputError: it is missing, cut off, or written by something else.
         """
         path = Path(path)
-        content = load_safely(path / FILE_NAME if path.is_dir() else path, KIND)
+        content = load_safely(path / CHECKPOINT if path.is_dir() else path, KIND)
         content.pop("kind")
         found = content.pop("format", None)
         if found != FORMAT or set(content) != set(cls.__dataclass_fields__):

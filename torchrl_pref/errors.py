@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import math
+import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
+
+LONGEST = 1200
+"""Letters of an error that are shown."""
 
 
 class InputError(ValueError):
@@ -85,6 +89,14 @@ def check_choice(name: str, value: Any, choices: tuple[str, ...]) -> str:
     return str(value)
 
 
+def one_line(error: Exception) -> str:
+    """What an error says, without line breaks, what a terminal would act upon, and the middle of
+    what is too long; other blanks may be of a path, and stay."""
+    text = re.sub(r"\s*\n\s*", " ", str(error)).strip()
+    text = re.sub(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]", "?", text)
+    return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} … {text[-LONGEST // 2 :]}"
+
+
 @contextmanager
 def one_line_errors() -> Iterator[None]:
     """End the program with status 2 and one line on stderr where the input was at fault.
@@ -94,5 +106,5 @@ def one_line_errors() -> Iterator[None]:
     try:
         yield
     except (InputError, OSError) as error:
-        print("error: " + " ".join(str(error).split()), file=sys.stderr)
+        print(f"error: {one_line(error)}", file=sys.stderr)
         raise SystemExit(2) from None

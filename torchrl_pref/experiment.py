@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from torchrl_pref.belief import Belief, uniform_sphere
-from torchrl_pref.checkpoint import Checkpoint
+from torchrl_pref.checkpoint import Checkpoint, picks_by_index
 from torchrl_pref.envs import FeedEnv, QueryEnv
 from torchrl_pref.errors import InputError, check_choice, check_positive, check_seed
 from torchrl_pref.features import Normalizer
@@ -166,6 +166,17 @@ def make_feed_env(
     return FeedEnv(pool, offers=setup["offers"], **kinds, **common)
 
 
+def make_training_env(
+    settings: Settings, task: Task, pool: QueryPool, sessions: int, seed: int
+) -> QueryEnv | FeedEnv:
+    """The environment in which a policy of these settings learns, on a normalised pool."""
+    if settings["setup"]["name"] == "feed":
+        return make_feed_env(settings, task, pool, sessions, seed)
+    # A policy that learns an index has the whole pool before it.
+    candidates = None if picks_by_index(settings) else settings["setup"]["candidates"]
+    return make_query_env(settings, task, pool, sessions, seed, candidates)
+
+
 def _session_arguments(settings: Settings, task: Task, sessions: int, seed: int) -> dict[str, Any]:
     """What both environments are made with."""
     belief = settings["belief"]
@@ -188,14 +199,7 @@ def make_trainer(settings: Settings, task: Task) -> Trainer:
     """
     a2c = A2CSettings(**settings["training"])
     seed = check_seed("seed", settings["seed"])
-    env: QueryEnv | FeedEnv
-    if settings["setup"]["name"] == "feed":
-        env = make_feed_env(settings, task, task.train, a2c.sessions, seed)
-    else:
-        # The paper's policy learns an index of the whole pool.
-        by_index = settings["policy"]["name"] == "paper"
-        candidates = None if by_index else settings["setup"]["candidates"]
-        env = make_query_env(settings, task, task.train, a2c.sessions, seed, candidates)
+    env = make_training_env(settings, task, task.train, a2c.sessions, seed)
     # The policy's initial weights come from the global generator.
     torch.manual_seed(seed)
     return Trainer(env, make_policy(settings, env), a2c, seed)

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torchrl_pref.heldout import Outcome, Results, two_way_interval
 from torchrl_pref.reports import draw_band, save_figure, signed
+from torchrl_pref.writing import replacing, write_text
 
 COLORS = {
     "RL": "#0072b2",
@@ -81,7 +82,7 @@ def cell_table(outcomes: dict[str, Outcome]) -> str:
 
 
 def write_heldout(folder: Path, results: Results) -> None:
-    """Print every table; write them, the curves and the figure to a folder and say where."""
+    """Write every table, the curves and the figure to a folder; print the tables and say where."""
     parts = []
     for cell, outcomes in results.items():
         n_pools, _, n_humans = next(iter(outcomes.values())).alignment.shape[:3]
@@ -92,11 +93,10 @@ def write_heldout(folder: Path, results: Results) -> None:
         )
         parts += ["", cell_table(outcomes), ""]
     text = "\n".join(parts)
-    print("\n" + text)
-    (folder / "heldout.txt").write_text(text)
+    write_text(folder / "heldout.txt", text)
     _write_curves(results, folder / "heldout.csv")
     figure(results, folder / "heldout.png")
-    print(f"written to {folder}: heldout.txt, heldout.csv, heldout.png")
+    print(f"\n{text}\nwritten to {folder}: heldout.txt, heldout.csv, heldout.png")
 
 
 def figure(results: Results, path: Path) -> None:
@@ -145,7 +145,7 @@ def _interval(values: Tensor) -> str:
 
 def _write_curves(results: Results, path: Path) -> None:
     """Write every mean curve as CSV."""
-    with path.open("w", newline="") as file:
+    with replacing(path) as partial, partial.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["setup", "tau", "features", "strategy", "queries", "mean", "low", "high"])
         for cell, outcomes in results.items():

@@ -5,6 +5,8 @@ Shapes: B sessions, H query budget, K options per query, R possible answers, D f
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Generator, Tensor
@@ -50,7 +52,9 @@ class SimulatedHuman:
         human = {"omega": omega, "noise": noise, "care": self.spread**exponent}
         return TensorDict(human, [n_sessions], device=generator.device)
 
-    def respond(self, queries: Tensor, human: TensorDictBase, turn: Tensor) -> Tensor:
+    def respond(
+        self, queries: Tensor, human: TensorDictBase | Mapping[str, Tensor], turn: Tensor
+    ) -> Tensor:
         """Pick one option of a query, by the Gumbel-max trick.
 
         Args:

@@ -5,9 +5,7 @@ Shapes: N queries, K options per query, D features, T trajectory length.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,6 +17,7 @@ from torch import Tensor
 from torchrl_pref.errors import InputError, check_count
 from torchrl_pref.features import check_features, corner_distances
 from torchrl_pref.gridworld import random_walks
+from torchrl_pref.writing import replacing
 
 
 @dataclass(frozen=True)
@@ -118,17 +117,13 @@ def save_atomically(content: dict[str, Any], path: str | Path) -> None:
         InputError: the file cannot be written.
     """
     path = Path(path)
-    partial = path.with_name(path.name + ".partial")
     try:
-        torch.save(content, partial)
-        os.replace(partial, path)
+        with replacing(path) as partial, partial.open("wb") as file:
+            torch.save(content, file)
     except (OSError, RuntimeError) as error:  # torch reports a full disk as the latter
         raise InputError(
             f"{path}: cannot be written ({error}); free some space there, or name another folder"
         ) from error
-    finally:
-        with contextlib.suppress(OSError):
-            partial.unlink()
 
 
 def load_safely(path: str | Path, kind: str) -> dict[str, Any]:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
-from collections.abc import Mapping, Sequence
-from itertools import pairwise
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +14,7 @@ from tabulate import tabulate
 from torch import Tensor
 
 from torchrl_pref.evaluation import CURVES, Evaluation, bootstrap_interval
+from torchrl_pref.writing import replacing, write_text
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -109,7 +108,7 @@ def signed(mean: float, interval: tuple[float, float]) -> str:
 
 def write_curves(panels: Mapping[str, Results], path: Path) -> None:
     """Write every curve as CSV: panel, strategy, queries asked, metric, mean and 95% interval."""
-    with path.open("w", newline="") as file:
+    with replacing(path) as partial, partial.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["panel", "strategy", "queries", "metric", "mean", "low", "high"])
         for panel, results in panels.items():
@@ -165,42 +164,12 @@ def draw_band(axis: Axes, means: Tensor, intervals: Tensor, **line: Any) -> None
     )
 
 
-def figure_2(histories: Mapping[str, Sequence[float]], path: Path) -> None:
-    """The paper's Figure 2: mean length of the training episodes against the number of updates."""
-    figure, axis = plt.subplots(figsize=(5.6, 4))
-    for name, values in histories.items():
-        axis.plot(*smoothed(values, geometric_edges(len(values))), label=name)
-    # Most of it happens in the first hundredth of the updates.
-    axis.set(xlabel="A2C updates", ylabel="training episode length (offers)", xscale="log")
-    axis.grid(alpha=0.25)
-    axis.legend(frameon=False)
-    save_figure(figure, path)
-
-
-def training_figure(history: Mapping[str, Sequence[float]], path: Path) -> None:
-    """How training went: means over the episodes that ended (alignment, length, reward) and what
-    the critic knew of the returns, against the number of updates."""
-    names = [name for name in history if name.startswith("train/")]
-    figure, axes = plt.subplots(1, len(names), figsize=(4.2 * len(names), 3.4))
-    for axis, name in zip(axes, names, strict=True):
-        axis.plot(*smoothed(history[name], even_edges(len(history[name]))), color=STYLE["RL"][0])
-        label = name.removeprefix("train/").replace("_", " ")
-        axis.set(xlabel="A2C updates", ylabel=label)
-        axis.grid(alpha=0.25)
-    save_figure(figure, path)
-
-
-def write_report(
-    folder: Path,
-    panels: Mapping[str, Results],
-    histories: Mapping[str, Mapping[str, Sequence[float]]],
-) -> None:
-    """Print the tables of each panel; write tables, curves and figures to a folder and say where.
+def write_report(folder: Path, panels: Mapping[str, Results]) -> None:
+    """Write tables, curves and figures to a folder; print the tables of each panel and say where.
 
     Args:
         folder: an existing folder.
         panels: evaluations by strategy, by the title of the panel.
-        histories: training metrics by the name of the learned policy; may be empty.
     """
     tables = []
     for title, results in panels.items():
@@ -209,78 +178,15 @@ def write_report(
         tables += [heading, "", alignment_table(results), ""]
         tables += ["after the last query", "", detail_table(results), ""]
     text = "\n".join(tables)
-    print("\n" + text)
-    (folder / "tables.txt").write_text(text)
+    write_text(folder / "tables.txt", text)
     write_curves(panels, folder / "curves.csv")
     figure_1(panels, folder / "figure_1.png")
-    written = ["tables.txt", "curves.csv", "figure_1.png"]
-    lengths = {
-        name: history["train/episode_length"]
-        for name, history in histories.items()
-        if name.startswith("RL-feed")
-    }
-    if lengths:
-        figure_2(lengths, folder / "figure_2.png")
-        written.append("figure_2.png")
-    if len(histories) == 1:
-        training_figure(next(iter(histories.values())), folder / "training.png")
-        written.append("training.png")
-    print(f"written to {folder}: {', '.join(written)}")
-
-
-def write_summary(folder: Path, overrides: Sequence[str], result: Evaluation) -> None:
-    """Write what :func:`sweep_table` gathers: the keys typed and the policy's final numbers."""
-    numbers = {
-        f"alignment after {j}": round(float(result.alignment[:, j].mean()), 4)
-        for j in milestones(result.alignment.shape[1] - 1)
-    }
-    numbers["bits"] = round(float(result.information[:, -1].mean()), 3)
-    numbers["asked"] = round(float(result.asked.float().mean()), 2)
-    content = {"overrides": list(overrides), **numbers}
-    (folder / "summary.json").write_text(json.dumps(content, indent=1) + "\n")
-
-
-def sweep_table(folder: Path) -> str:
-    """One row for each finished job of a sweep; also written to the sweep's ``summary.csv``."""
-    rows = []
-    for path in sorted(folder.glob("*/summary.json"), key=lambda path: path.parent.name.zfill(9)):
-        content = json.loads(path.read_text())
-        keys = dict(override.split("=", 1) for override in content.pop("overrides"))
-        rows.append({"job": path.parent.name, **keys, **content})
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    with (folder / "summary.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, names, restval="")
-        writer.writeheader()
-        writer.writerows(rows)
-    return f"\nsweep so far, {folder / 'summary.csv'}\n" + tabulate(rows, headers="keys")
-
-
-def smoothed(values: Sequence[float], edges: Sequence[int]) -> tuple[list[float], list[float]]:
-    """Means of the known values between edges (1-based updates), and the updates' middles."""
-    middles, means = [], []
-    for start, end in pairwise(edges):
-        known = [value for value in values[start - 1 : end - 1] if not math.isnan(value)]
-        if known:
-            middles.append((start + end - 1) / 2)
-            means.append(sum(known) / len(known))
-    return middles, means
-
-
-def even_edges(count: int) -> list[int]:
-    """Edges of at most 100 stretches of equal length that cover updates 1 to ``count``."""
-    return [*range(1, count + 1, math.ceil(count / 100)), count + 1]
-
-
-def geometric_edges(count: int) -> list[int]:
-    """Edges of stretches each about a tenth longer than the one before."""
-    edges = [1]
-    while edges[-1] <= count:
-        edges.append(min(count + 1, math.ceil(edges[-1] * 1.1 + 1e-9)))
-    return edges
+    print(f"\n{text}\nwritten to {folder}: tables.txt, curves.csv, figure_1.png")
 
 
 def save_figure(figure: Figure, path: Path) -> None:
     """Write a figure to a file and close it."""
     figure.tight_layout()
-    figure.savefig(path, dpi=150)
+    with replacing(path) as partial:
+        figure.savefig(partial, dpi=150)
     plt.close(figure)

@@ -195,6 +195,15 @@ class Optimal(ResponseModel):
         return "Optimal()"
 
 
+def compiled_constants(response_model: ResponseModel) -> tuple[float, float] | None:
+    """What the compiled loops know a model by: tau and tolerance; None for others than ours."""
+    if isinstance(response_model, Boltzmann):
+        return response_model.tau, 0.0
+    if isinstance(response_model, Optimal):
+        return math.inf, response_model.tolerance
+    return None
+
+
 def _refuse_subclass(cls: type, parent: type) -> None:
     """Closed forms of its own likelihood make a model unfit to be derived from.
 

@@ -2,8 +2,9 @@
 
 ``python benchmarks/quality.py RUN [RUN ...]`` takes the run folders (or checkpoints) of trainings
 of ``train.py``, and puts each beside the package's five policies of the same setup and human: the
-same pools, humans, luck and offers. Nothing is trained. The interval is over pools and runs; the
-seeds of the pools are neither those of any training nor those of the held-out protocol.
+same pools, humans, luck and offers. Nothing is trained. With fewer than five runs each faces the
+humans more than once, so that both sides are told equally well. The interval is over pools and
+runs; the seeds of the pools are neither those of any training nor those of the held-out protocol.
 
 Shapes: P pools, S runs, B humans, H query budget.
 """
@@ -15,6 +16,7 @@ from pathlib import Path
 
 sys.path[0] = str(Path(__file__).resolve().parents[1])  # this folder's select.py hides Python's
 
+import math
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from typing import NamedTuple
@@ -101,12 +103,14 @@ def run_pool(job: Job) -> list[list[list[float]]]:
         return make(settings, task, task.test, sessions, job.pool)
 
     env = make_env(job.humans)
-    mine = [Checkpoint.load(run) for run in job.runs]
-    lineup = [("mine", load_policy(one, env).strategy) for one in mine]
+    mine = {run: Checkpoint.load(run) for run in job.runs}
+    times = math.ceil(SEEDS / len(mine))
+    lineup = [(run, load_policy(one, env).strategy) for run, one in mine.items()] * times
     lineup += [("shipped", load_policy(one, env).strategy) for one in shipped]
     results = run_side_by_side(make_env, draw_humans(env), lineup)
-    curves = [[one.alignment.mean(0) for one in results[name]] for name in ("mine", "shipped")]
-    return [[[float(c[-1]), float(c[1:].mean())] for c in group] for group in curves]
+    curves = [torch.stack([one.alignment for one in results[run]]).mean((0, 1)) for run in mine]
+    beside = [one.alignment.mean(0) for one in results["shipped"]]
+    return [[[float(c[-1]), float(c[1:].mean())] for c in group] for group in (curves, beside)]
 
 
 def row_of(cell: Cell, mine: Tensor, shipped: Tensor) -> common.Row:

@@ -99,7 +99,7 @@ def test_resumed_run_equals_an_uninterrupted_one_bit_for_bit(
                 load_weights(trainer.policy, checkpoint)
                 torch.rand(7)  # whatever else used the global generator
                 trainer.load_state_dict(checkpoint.training)
-            finished = trainer.run(
+            trainer.run(
                 tmp_path / f"run{len(stops)}",
                 lambda s=settings, k=task, t=trainer, p=path: make_checkpoint(s, k, t).save(p),
             )

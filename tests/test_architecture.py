@@ -8,12 +8,13 @@ import torchrl_pref
 PACKAGE = Path(torchrl_pref.__file__).parent
 
 LAYERS = [
-    {"errors", "compiled"},
+    {"errors", "compiled", "writing"},
+    {"checks", "files"},
     {"responses", "sampler_cpu"},
     {"acquisition", "sampler"},
     {"belief", "features", "gridworld"},
-    {"queries", "humans", "objectives"},
-    {"envs"},
+    {"queries", "humans", "objectives", "sessions"},
+    {"contents", "envs", "restore"},
     {"strategies"},
     {"scorer", "attention"},
     {"policies"},

@@ -21,6 +21,7 @@ from torchrl_pref.humans import SimulatedHuman
 from torchrl_pref.policies import Policy, attention_policy, paper_policy, scorer_policy
 from torchrl_pref.queries import QueryPool, gridworld_pool
 from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel, calibrate_tau
+from torchrl_pref.restore import restore_weights
 from torchrl_pref.training import A2CSettings, Trainer
 
 Settings = dict[str, Any]
@@ -258,10 +259,7 @@ def load_weights(policy: Policy, checkpoint: Checkpoint) -> None:
     Raises:
         InputError: they belong to another policy or to other sizes.
     """
-    try:
-        policy.weights.load_state_dict(checkpoint.weights)
-    except RuntimeError as error:
-        raise InputError(f"the checkpoint's weights do not fit this run: {error}") from error
+    restore_weights(policy.weights, checkpoint.weights)
 
 
 def load_policy(checkpoint: Checkpoint, env: QueryEnv | FeedEnv) -> Policy:

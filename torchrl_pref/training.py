@@ -16,7 +16,7 @@ from types import FrameType
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
 from torchrl.collectors import Collector
@@ -27,8 +27,21 @@ from torchrl.record.loggers import Logger, get_logger
 from tqdm import tqdm
 
 from torchrl_pref.envs import FeedEnv, QueryEnv
-from torchrl_pref.errors import check_choice, check_count, check_positive, check_share
+from torchrl_pref.errors import (
+    InputError,
+    check_choice,
+    check_count,
+    check_positive,
+    check_share,
+)
 from torchrl_pref.policies import Policy
+from torchrl_pref.restore import (
+    restore_generator,
+    restore_logs,
+    restore_optimizer,
+    restore_sessions,
+    restore_weights,
+)
 
 LOGGERS = ("csv", "tensorboard")
 
@@ -174,7 +187,8 @@ class Trainer:
             Whether training ran to its end.
         """
         settings, progress = self.settings, self.progress
-        loggers = [_open_logger(kind, folder, progress.update) for kind in LOGGERS]
+        restore_logs(folder / "csv" / "scalars", progress.history)
+        loggers = [_open_logger(kind, folder) for kind in LOGGERS]
         bar = tqdm(total=settings.updates, initial=progress.update, desc="training", unit="update")
         with bar, _stop_request() as stopped:
             batches = iter(self.collector)
@@ -247,15 +261,25 @@ class Trainer:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on where :meth:`state_dict` was taken; the average is what the policy holds now."""
+        """Go on where :meth:`state_dict` was taken; the average is what the policy holds now.
+
+        Raises:
+            InputError: the state was taken of another run.
+        """
         self.start_average()
-        self.policy.weights.load_state_dict(state["weights"])
+        if set(state["history"]) != set(self.progress.history):
+            raise InputError(
+                f"the checkpoint's history has {', '.join(state['history'])[:200]}: expected "
+                f"{', '.join(self.progress.history)}; use the version that wrote it"
+            )
         self.progress = Progress(state["update"], state["history"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        sessions = TensorDict(state["sessions"], self.env.batch_size, device=self.env.device)
-        self.collector._carrier.update(sessions)
-        self.env.generator.set_state(state["env_generator"])
-        torch.set_rng_state(state["global_generator"])
+        restore_weights(self.policy.weights, state["weights"])
+        restore_optimizer(self.optimizer, state["optimizer"]["state"])
+        carrier = self.collector._carrier
+        session = carrier.select(*self.env.state_spec.keys())
+        restore_sessions(carrier, state["sessions"], session, len(self.env.features))
+        restore_generator(self.env.generator, state["env_generator"])
+        restore_generator(torch.default_generator, state["global_generator"])
 
 
 def _episode_metrics(batch: TensorDictBase) -> dict[str, float]:
@@ -282,11 +306,8 @@ def _latest(history: dict[str, list[float]]) -> dict[str, str]:
     return latest
 
 
-def _open_logger(kind: str, folder: Path, update: int) -> Logger:
-    """A TorchRL logger; CSV rows that a resumed run will write again are dropped first."""
-    for path in (folder / "csv" / "scalars").rglob("*.csv") if kind == "csv" else ():
-        rows = path.read_text().splitlines(keepends=True)
-        path.write_text("".join(row for row in rows if int(row.split(",")[0]) <= update))
+def _open_logger(kind: str, folder: Path) -> Logger:
+    """A TorchRL logger."""
     logger = get_logger(kind, logger_name=str(folder), experiment_name=kind)
     assert logger is not None
     return logger

@@ -78,8 +78,8 @@ class Checkpoint:
         content = load_safely(file, KIND)
         content.pop("kind")
         found = content.pop("format", None)
-        if found != FORMAT or set(content) != set(cls.__dataclass_fields__):
-            version = found if type(found) is int else "unknown"
+        version = found if type(found) is int and 0 <= found < 1000 else "unknown"
+        if version != FORMAT or set(content) != set(cls.__dataclass_fields__):
             raise InputError(
                 f"{path}: written by another version of this package (format {version}, expected "
                 f"{FORMAT}); train again, or use the version that wrote it"

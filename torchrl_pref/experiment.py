@@ -6,6 +6,7 @@ things and are never code to call, so that a foreign checkpoint can do no harm.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -123,7 +124,7 @@ def reload_task(checkpoint: Checkpoint, train: Path, test: Path) -> Task:
     """The task of a run from its pool files; made again from its settings where they are gone.
 
     Raises:
-        InputError: the pools are not those that the checkpoint was trained with.
+        InputError: the pools or the human are not those that the checkpoint was trained with.
     """
     settings = checkpoint.settings
     if train.is_file() and test.is_file():
@@ -131,6 +132,13 @@ def reload_task(checkpoint: Checkpoint, train: Path, test: Path) -> Task:
     else:
         pools = make_pools(settings)
     task = make_task(*pools, settings["tau"])
+    if task.tau != checkpoint.tau and not (
+        task.tau and checkpoint.tau and math.isclose(task.tau, checkpoint.tau, rel_tol=0.01)
+    ):
+        raise InputError(
+            f"the checkpoint does not fit its settings: its human has tau={checkpoint.tau}, and "
+            f"tau={settings['tau']} makes it {task.tau}; restore a copy of the checkpoint"
+        )
     for name, pool, digest in (
         ("train", task.train, checkpoint.train_digest),
         ("test", task.test, checkpoint.test_digest),

@@ -105,7 +105,10 @@ def check_weights(name: str, weights: Any) -> None:
     for key, value in weights.items():
         fits = type(key) is str and _is_weight(value)
         _expect(
-            fits, name, f"dense float32 tensors without NaN or infinity, and {key!r:.60} is not one"
+            fits,
+            name,
+            f"float32 tensors without NaN or infinity, and {key!r:.60} is none (a training that "
+            "diverged leaves NaN: lower training.learning_rate)",
         )
 
 

@@ -36,6 +36,9 @@ MAX_FILE = 4 * 2**30
 PIECE = 2**20
 """Bytes read at once; the zip's directory must be smaller, which is room for 10,000 tensors."""
 
+MAX_PICKLE = 2**28
+"""Bytes of the pickle, room for the history of millions of updates; a number takes 32 in memory."""
+
 MAX_OBJECTS = 200_000
 """Instructions of the pickle, numbers of a training's history apart: each costs some 100 bytes."""
 
@@ -160,6 +163,8 @@ def _checked_copy(file: _Piecewise, size: int) -> io.BytesIO:
         packed = [m for m in old.infolist() if m.compress_type or m.file_size != m.compress_size]
         if packed or len(members) != len(old.infolist()) or sum(sizes.values()) > size:
             raise zipfile.BadZipFile("its parts are compressed, or named or stored twice")
+        if sizes["data.pkl"] > MAX_PICKLE:
+            raise zipfile.BadZipFile("its pickle is too large")
         for name, member in members.items():
             # Reading a member to its end compares its checksum.
             with old.open(member) as source:

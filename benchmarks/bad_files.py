@@ -218,8 +218,8 @@ def serve(pipe: Connection, folder: Path) -> None:
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + LIMIT, used + LIMIT))
     pipe.send("ready")
-    while True:
-        door, path = pipe.recv()
+    while (told := pipe.recv()) is not None:
+        door, path = told
         os.chdir(path.parent if os.path.isdir(path.parent) else folder)
         Path("/proc/self/clear_refs").write_text("5")  # the highest memory use is measured anew
         before = memory("VmRSS")
@@ -255,8 +255,8 @@ class Opener:
         self.pipe.recv()
 
     def stop(self) -> None:
-        """End it."""
-        self.process.kill()
+        """Let it end."""
+        self.pipe.send(None)
         self.process.join()
 
     def open(self, door: str, path: Path) -> tuple[str, int]:
@@ -268,7 +268,8 @@ class Opener:
             became = "hang"
         except (EOFError, ConnectionError):
             became = "crash"
-        self.stop()
+        self.process.kill()
+        self.process.join()
         self.start()
         return became, 0
 

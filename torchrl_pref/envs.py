@@ -47,7 +47,6 @@ from torchrl_pref.errors import (
     check_choice,
     check_count,
     check_flag,
-    check_seed,
     check_type,
 )
 from torchrl_pref.humans import SimulatedHuman
@@ -79,7 +78,7 @@ class SessionEnv(EnvBase):
         check_type("pool", pool, QueryPool, "QueryPool(features)")
         check_type("human", human, SimulatedHuman, "SimulatedHuman(Boltzmann(2.0))")
         check_type("belief", belief, Belief, "Belief(Boltzmann(2.0))")
-        check_seed("seed", seed)
+        check_count("seed", seed, 0)
         super().__init__(device=device, batch_size=torch.Size(batch_size))
         self.register_buffer("features", pool.features.to(device))
         self.human = human

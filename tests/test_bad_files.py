@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks import spoil
+from benchmarks import spoil, spoil_contents
 from benchmarks.bad_files import Bench, all_cases, looks, outcome, placed
 from torchrl_pref.checkpoint import Checkpoint
 from torchrl_pref.errors import InputError
@@ -48,6 +48,23 @@ def test_a_sample_of_bad_files_is_refused_or_harmless(
     assert {case: what for case, what in found.items() if what not in good} == {}
 
 
+@pytest.mark.parametrize("name", spoil_contents.EDITS)
+def test_a_checkpoint_of_impossible_content_is_refused(
+    name: str, bench: Bench, tmp_path: Path
+) -> None:
+    content = torch.load(bench.files["checkpoint"], weights_only=True)
+    edit = spoil_contents.EDITS[name]
+    path = spoil_contents.edited(content, "", name, edit).make(tmp_path)
+    assert outcome(bench, "checkpoint", path) == "refused"
+
+
+def test_a_pool_of_impossible_content_is_refused(bench: Bench, tmp_path: Path) -> None:
+    cases = list(spoil_contents.spoiled_pools())
+    assert len(cases) > 20
+    for case in cases:
+        assert outcome(bench, "pool", case.make(tmp_path)) == "refused", case.name
+
+
 def test_every_flipped_bit_of_a_small_pool_is_noticed_or_changes_nothing(tmp_path: Path) -> None:
     pool = QueryPool(torch.rand(2, 2, 2))
     pool.save(tmp_path / "pool.pt")
@@ -81,7 +98,8 @@ def test_what_is_compressed_or_too_large_is_not_unpacked(tmp_path: Path) -> None
     gridworld_pool(20).save(tmp_path / "pool.pt")
     with (
         zipfile.ZipFile(tmp_path / "pool.pt") as stored,
-        zipfile.ZipFile(tmp_path / "deflated.pt", "w", zipfile.ZIP_DEFLATED) as deflated,
+        # Level 0 packs nothing: it is refused as what may unpack to anything.
+        zipfile.ZipFile(tmp_path / "deflated.pt", "w", 8, compresslevel=0) as deflated,
     ):
         for member in stored.infolist():
             deflated.writestr(member.filename, stored.read(member))
@@ -111,6 +129,20 @@ def test_pickles_are_held_to_what_is_in_the_file(value: object, message: str) ->
     _check_pickle(spoil.pickled({"kind": "query pool", "features": fine}), {"data/0": 16})
     with pytest.raises(ValueError, match=message):
         _check_pickle(spoil.pickled({"kind": "query pool", "features": value}), {"data/0": 16})
+
+
+def test_a_file_is_held_to_it(tmp_path: Path) -> None:
+    """torch would make the bytes, as many as are asked for, and nobody would look at them."""
+    features = torch.rand(3, 2, 2)
+    for more, fine in ((5, True), (spoil._Call(bytearray, 10), False)):
+        content = {"kind": "query pool", "features": features, "more": more}
+        torch.save(content, tmp_path / "pool.pt")
+        assert torch.load(tmp_path / "pool.pt", weights_only=True)
+        if fine:
+            assert torch.equal(QueryPool.load(tmp_path / "pool.pt").features, features)
+        else:
+            with pytest.raises(InputError, match="cannot be read"):
+                QueryPool.load(tmp_path / "pool.pt")
 
 
 def test_a_storage_cannot_be_smuggled_past_the_check() -> None:

@@ -41,7 +41,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from benchmarks import common, spoil, spoil_contents
+from benchmarks import common, spoil, spoil_contents, spoil_hostile
 from benchmarks.spoil import MARKER, Case
 from torchrl_pref import comparison, experiment
 from torchrl_pref.checkpoint import KIND, Checkpoint
@@ -170,8 +170,8 @@ def all_cases(bench: Bench, flips: int, seed: int) -> Iterator[Case]:
     for door, kind, other in (("pool", "query pool", "checkpoint"), ("checkpoint", KIND, "pool")):
         yield from spoil.foreign(door, good[door], good[other])
         yield from spoil.in_its_place(door, good[door])
-        yield from spoil.payloads(door, kind)
-        yield from spoil.hostile(door, kind)
+        yield from spoil_hostile.payloads(door, kind)
+        yield from spoil_hostile.hostile(door, kind)
     yield from spoil.in_its_place("log", good["log"])
     yield from spoil.rows_of_logs()
     content = torch.load(bench.files["checkpoint"], weights_only=True)

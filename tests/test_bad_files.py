@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks import spoil, spoil_contents
+from benchmarks import spoil, spoil_contents, spoil_hostile
 from benchmarks.bad_files import Bench, all_cases, looks, outcome, placed
 from torchrl_pref.checkpoint import Checkpoint
 from torchrl_pref.errors import InputError
@@ -115,26 +115,37 @@ def test_what_is_compressed_or_too_large_is_not_unpacked(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        (spoil.tensor(spoil._Storage(torch.FloatStorage, "0", 99), (99,), (1,)), "another size"),
-        (spoil.tensor(spoil._Storage(torch.DoubleStorage, "0", 4), (4,), (1,)), "another size"),
-        (spoil.tensor(spoil._Storage(torch.FloatStorage, "1", 4), (4,), (1,)), "another size"),
-        (spoil._Call(torch.FloatStorage, 10), "used for something else"),
-        (spoil._Call(bytearray, 10), "not what this package writes"),
+        (
+            spoil_hostile.tensor(spoil_hostile.Storage(torch.FloatStorage, "0", 99), (99,), (1,)),
+            "another size",
+        ),
+        (
+            spoil_hostile.tensor(spoil_hostile.Storage(torch.DoubleStorage, "0", 4), (4,), (1,)),
+            "another size",
+        ),
+        (
+            spoil_hostile.tensor(spoil_hostile.Storage(torch.FloatStorage, "1", 4), (4,), (1,)),
+            "another size",
+        ),
+        (spoil_hostile.Call(torch.FloatStorage, 10), "used for something else"),
+        (spoil_hostile.Call(bytearray, 10), "not what this package writes"),
         ([[] for _ in range(100_000)], "not what this package writes"),
     ],
     ids=["more bytes", "other type", "other part", "storage", "bytes", "too much"],
 )
 def test_pickles_are_held_to_what_is_in_the_file(value: object, message: str) -> None:
-    fine = spoil.tensor(spoil._Storage(torch.FloatStorage, "0", 4), (4,), (1,))
-    _check_pickle(spoil.pickled({"kind": "query pool", "features": fine}), {"data/0": 16})
+    fine = spoil_hostile.tensor(spoil_hostile.Storage(torch.FloatStorage, "0", 4), (4,), (1,))
+    _check_pickle(spoil_hostile.pickled({"kind": "query pool", "features": fine}), {"data/0": 16})
     with pytest.raises(ValueError, match=message):
-        _check_pickle(spoil.pickled({"kind": "query pool", "features": value}), {"data/0": 16})
+        _check_pickle(
+            spoil_hostile.pickled({"kind": "query pool", "features": value}), {"data/0": 16}
+        )
 
 
 def test_a_file_is_held_to_it(tmp_path: Path) -> None:
     """torch would make the bytes, as many as are asked for, and nobody would look at them."""
     features = torch.rand(3, 2, 2)
-    for more, fine in ((5, True), (spoil._Call(bytearray, 10), False)):
+    for more, fine in ((5, True), (spoil_hostile.Call(bytearray, 10), False)):
         content = {"kind": "query pool", "features": features, "more": more}
         torch.save(content, tmp_path / "pool.pt")
         assert torch.load(tmp_path / "pool.pt", weights_only=True)

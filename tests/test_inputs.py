@@ -277,6 +277,7 @@ def test_humans_of_another_session_are_refused(pool: QueryPool, generator: Gener
         (humans(QueryPool(torch.rand(9, 3, 4))), "human.noise of shape (4, 5, 3)"),
         (humans(QueryPool(torch.rand(9, 2, 3))), "human.omega of shape (4, 3): expected (4, 4)"),
         (TensorDict({"humans": torch.ones(4)}, [4]), "set_state=True with none of"),
+        (TensorDict({"human": torch.ones(4)}, [4]), "set_state=True with none of"),
     ):
         assert message in refused(lambda g=given: env.reset(g, set_state=True))
 

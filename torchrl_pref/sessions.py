@@ -45,15 +45,23 @@ def check_state(given: TensorDictBase, fresh: TensorDictBase, n_queries: int) ->
         InputError: a shape, a type or a number is impossible, or the parts contradict each other.
     """
     state: dict[Key, Tensor] = {}
+    parts = dict(given.items(True, True))
     for key, expected in fresh.items(True, True):
-        value = given.get(key, None)
-        if value is not None:
-            state[key] = _check_part(_name(key), value, expected)
+        if key in parts:
+            state[key] = _check_part(_name(key), parts[key], expected)
     if not state:
         raise InputError(
             f"set_state=True with none of {', '.join(map(_name, fresh.keys(True, True)))}: "
             "expected at least one; give humans as env.reset() returns them, or set_state=False"
         )
+    _check_ranges(state, fresh, n_queries)
+    _check_vectors(state)
+    _check_history(state)
+    return TensorDict(state, fresh.batch_size, device=fresh.device)
+
+
+def _check_ranges(state: dict[Key, Tensor], fresh: TensorDictBase, n_queries: int) -> None:
+    """Indices point at something, and counts are within the session."""
     n_asks, n_options = fresh["human", "noise"].shape[1:]
     n_offers = 0 if fresh.get("offers", None) is None else fresh["offers"].shape[1]
     limits: dict[Key, tuple[int, int, str]] = {
@@ -67,9 +75,6 @@ def check_state(given: TensorDictBase, fresh: TensorDictBase, n_queries: int) ->
     for key, limit in limits.items():
         if key in state:
             check_range(_name(key), state[key], *limit)
-    _check_vectors(state)
-    _check_history(state)
-    return TensorDict(state, fresh.batch_size, device=fresh.device)
 
 
 def _name(key: Any) -> str:

@@ -154,6 +154,7 @@ EDITS: dict[str, Edit] = {
     "std -1": fill(-1, "std"),
     "std of another D": cut("std"),
     "tau NaN": put("tau", math.nan),
+    "tau of another human": put("tau", 9.5),
     "tau -1": put("tau", -1.0),
     "D = 5": put("pool_shape", "D", 5),
     "N = 0": put("pool_shape", "N", 0),

@@ -132,13 +132,6 @@ def reload_task(checkpoint: Checkpoint, train: Path, test: Path) -> Task:
     else:
         pools = make_pools(settings)
     task = make_task(*pools, settings["tau"])
-    if task.tau != checkpoint.tau and not (
-        task.tau and checkpoint.tau and math.isclose(task.tau, checkpoint.tau, rel_tol=0.01)
-    ):
-        raise InputError(
-            f"the checkpoint does not fit its settings: its human has tau={checkpoint.tau}, and "
-            f"tau={settings['tau']} makes it {task.tau}; restore a copy of the checkpoint"
-        )
     for name, pool, digest in (
         ("train", task.train, checkpoint.train_digest),
         ("test", task.test, checkpoint.test_digest),
@@ -148,6 +141,13 @@ def reload_task(checkpoint: Checkpoint, train: Path, test: Path) -> Task:
                 f"the checkpoint does not fit the {name} pool: digest {pool.digest[:12]}, trained "
                 f"with {digest[:12]}; restore {train.parent}/{name}_pool.pt"
             )
+    if task.tau != checkpoint.tau and not (
+        task.tau and checkpoint.tau and math.isclose(task.tau, checkpoint.tau, rel_tol=0.01)
+    ):
+        raise InputError(
+            f"the checkpoint does not fit its settings: its human has tau={checkpoint.tau}, and "
+            f"tau={settings['tau']} makes it {task.tau}; restore a copy of the checkpoint"
+        )
     return task
 
 

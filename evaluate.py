@@ -167,7 +167,8 @@ def find_checkpoints(named: list[str]) -> list[Path]:
     """
     paths = []
     for name in map(Path, named):
-        found = [name.resolve()] if name.is_file() else sorted(name.resolve().rglob(CHECKPOINT))
+        whole = Path(os.path.realpath(name))  # of a link to itself, too
+        found = [whole] if whole.is_file() else sorted(whole.rglob(CHECKPOINT))
         if not found:
             raise InputError(
                 f"checkpoint={name}: no {CHECKPOINT} there; expected a checkpoint file, the folder "

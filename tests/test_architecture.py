@@ -9,13 +9,13 @@ PACKAGE = Path(torchrl_pref.__file__).parent
 
 LAYERS = [
     {"errors", "compiled", "per_belief", "writing"},
-    {"checks", "memory", "responses", "runs", "sampler_cpu", "scoring_cpu"},
-    {"acquisition", "resampling_cpu", "settings"},
-    {"resampling"},
+    {"checks", "files", "memory", "runs", "sampler_cpu", "scoring_cpu", "tensors"},
+    {"responses", "resampling_cpu"},
+    {"acquisition", "resampling", "settings"},
     {"sampler", "features"},
     {"belief", "gridworld"},
-    {"queries", "humans", "objectives"},
-    {"envs"},
+    {"queries", "humans", "objectives", "sessions"},
+    {"contents", "envs", "restore"},
     {"strategies"},
     {"scorer", "attention"},
     {"policies"},

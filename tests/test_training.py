@@ -29,6 +29,8 @@ def settings_of(setup: str = "feed", policy: str = "scorer", **training: Any) ->
         "tau": "noisy",
         "seed": 0,
         "device": "cpu",
+        "threads": 1,
+        "overrides": [],
         "objective": "alignment",
         "skip": "free",
         "tau_spread": 1,

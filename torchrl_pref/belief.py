@@ -20,10 +20,11 @@ import torch
 from torch import Generator, Tensor
 from torch.nn import functional as F
 
-from torchrl_pref.errors import check_count
+from torchrl_pref.errors import check_count, check_type
 from torchrl_pref.resampling import kish_share, resample
 from torchrl_pref.responses import ResponseModel
 from torchrl_pref.sampler import Target, round_of_moves
+from torchrl_pref.tensors import check_finite, check_range
 
 MIN_SHARE = 0.25
 """Kish effective share of the samples that a reweighting must keep; below it a stage is added."""
@@ -64,8 +65,12 @@ def feature_gaps(queries: Tensor, answers: Tensor) -> Tensor:
 
     Returns:
         (… K-1 D). Zero where there is no answer, which makes that likelihood constant in ω.
+
+    Raises:
+        InputError: an answer is no whole number from -1 to K-1.
     """
     n_options = queries.shape[-2]
+    answers = check_range("answers", answers, -1, n_options - 1, "options from 0, -1 where none")
     shifts = torch.arange(1, n_options, device=queries.device)
     others = (answers.unsqueeze(-1) + shifts) % n_options
     chosen = torch.take_along_dim(queries, answers.clamp(min=0)[..., None, None], -2)
@@ -94,12 +99,13 @@ class Belief:
             and at least 4. They are repeated where the samples have not forgotten where they were.
 
     Raises:
-        InputError: ``samples`` or ``moves`` is too small.
+        InputError: there is no response model, or ``samples`` or ``moves`` is too small.
     """
 
     def __init__(
         self, response_model: ResponseModel, samples: int = 100, moves: int | None = None
     ) -> None:
+        check_type("response_model", response_model, ResponseModel, "Boltzmann(2.0)")
         self.response_model = response_model
         self.n_samples = check_count("belief.samples", samples, 2)
         self.n_moves = None if moves is None else check_count("belief.moves", moves, 1)
@@ -136,7 +142,11 @@ class Belief:
                 ignored, H may be 0.
             newest: (S K-1 D), feature gaps of the answer to condition on.
             generator: the source of all randomness, on the device of the samples.
+
+        Raises:
+            InputError: a sample or a gap is not finite.
         """
+        check_finite("samples or feature gaps", samples, earlier, newest)
         size = max(1, MOVED // (self.n_samples * self._moves_for(samples.shape[-1])))
         updates = []
         for first in range(0, max(1, len(samples)), size):

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
+from torchrl_pref.contents import check_content
 from torchrl_pref.errors import InputError
 from torchrl_pref.features import Normalizer
+from torchrl_pref.files import load_safely
 from torchrl_pref.progress import Progress
-from torchrl_pref.queries import QueryPool, load_safely, save_atomically
+from torchrl_pref.queries import QueryPool, save_atomically
 from torchrl_pref.runs import CHECKPOINT
 
 KIND = "torchrl_pref checkpoint"
@@ -73,17 +76,24 @@ class Checkpoint:
         """Read a checkpoint from a file or from the folder of a run, with ``weights_only=True``.
 
         Raises:
-            InputError: it is missing, cut off, or written by something else.
+            InputError: it is missing, cut off, spoiled, or written by something else.
         """
-        path = Path(path)
-        content = load_safely(path / CHECKPOINT if path.is_dir() else path, KIND)
+        file = Path(path) / CHECKPOINT if os.path.isdir(path) else path
+        content = load_safely(file, KIND)
         content.pop("kind")
         found = content.pop("format", None)
-        if found != FORMAT or set(content) != set(cls.__dataclass_fields__):
+        version = found if type(found) is int and 0 <= found < 1000 else "unknown"
+        if version != FORMAT or set(content) != set(cls.__dataclass_fields__):
             raise InputError(
-                f"{path}: written by another version of this package (format {found}, expected "
+                f"{path}: written by another version of this package (format {version}, expected "
                 f"{FORMAT}); train again, or use the version that wrote it"
             )
+        try:
+            check_content(content)
+        except InputError as error:
+            raise InputError(
+                f"{path}: {error}; restore a copy of the file, or train again"
+            ) from None
         return cls(**content)
 
     def check_fits(self, pool: QueryPool, own_indices: bool = False) -> None:

@@ -41,10 +41,18 @@ from torchrl.envs import EnvBase
 
 from torchrl_pref.acquisition import information_gain, score_queries
 from torchrl_pref.belief import Belief, feature_gaps
-from torchrl_pref.errors import InputError, check_choice, check_count, check_flag
+from torchrl_pref.errors import (
+    InputError,
+    check_choice,
+    check_count,
+    check_flag,
+    check_type,
+)
 from torchrl_pref.humans import SimulatedHuman
 from torchrl_pref.objectives import make_objective
 from torchrl_pref.queries import QueryPool
+from torchrl_pref.sessions import check_state
+from torchrl_pref.tensors import check_range, check_shape
 
 State: TypeAlias = TensorDict | dict[str, Any]
 """A state: a dictionary while a step makes it, as writing to a tensordict takes time."""
@@ -73,6 +81,11 @@ class SessionEnv(EnvBase):
     ) -> None:
         if not isinstance(batch_size, Sequence) or len(batch_size) != 1:
             raise InputError(f"batch_size={batch_size}: expected one size, such as (64,)")
+        check_count("batch_size", batch_size[0], 1)
+        check_type("pool", pool, QueryPool, "QueryPool(features)")
+        check_type("human", human, SimulatedHuman, "SimulatedHuman(Boltzmann(2.0))")
+        check_type("belief", belief, Belief, "Belief(Boltzmann(2.0))")
+        check_count("seed", seed, 0)
         super().__init__(device=device, batch_size=torch.Size(batch_size))
         self.register_buffer("features", pool.features.to(device))
         self.human = human
@@ -117,9 +130,14 @@ class SessionEnv(EnvBase):
     ) -> TensorDictBase:
         state = self._fresh_state()
         if set_state and tensordict is not None:
-            given = tensordict.select(*state.keys(True, True), strict=False)
-            state.update(given.to(self.device).clone())
+            state.update(check_state(tensordict, state, len(self.features)).clone())
         return self._start(state)
+
+    def _check_action(self, tensordict: TensorDictBase, n_actions: int, meaning: str) -> Tensor:
+        """The action (B) of each session; refused unless it is from 0 to ``n_actions`` - 1."""
+        action = check_range("action", tensordict.get("action"), 0, n_actions - 1, meaning)
+        check_shape("action", action, self.batch_size, "one number for each session")
+        return action
 
     def _fresh_state(self) -> TensorDict:
         """New humans who have answered nothing. The draws that strategies share come first."""
@@ -293,13 +311,24 @@ class QueryEnv(SessionEnv):
         state["action_mask"] = mask
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action = tensordict["action"].unsqueeze(-1)
-        index = tensordict["candidates"].gather(-1, action).squeeze(-1)
+        action = self._check_action(tensordict, self.n_candidates, "the place of a candidate")
+        index = tensordict["candidates"].gather(-1, action.unsqueeze(-1)).squeeze(-1)
+        if not self.repeats:
+            self._check_new(tensordict, index)
         state = self._ask(tensordict, index, tensordict["n_asked"].squeeze(-1) < self.budget)
         self._observe(state)
         reward = self._objective.potential(state) - self._objective.potential(tensordict)
         terminated = state["n_asked"] >= self.budget
         return self._finish(state, reward, torch.zeros_like(terminated), terminated)
+
+    def _check_new(self, tensordict: TensorDictBase, index: Tensor) -> None:
+        """Refuse to ask pool query ``index`` (B) again in a session that goes on."""
+        again = (tensordict["history", "queries"] == index.unsqueeze(-1)).any(-1, keepdim=True)
+        if (again & (tensordict["n_asked"] < self.budget)).any():
+            raise InputError(
+                "action: a query that was asked before, where repeats=False; expected one that "
+                "action_mask allows; mask the policy, or make the environment with repeats=True"
+            )
 
 
 class FeedEnv(SessionEnv):
@@ -389,9 +418,10 @@ class FeedEnv(SessionEnv):
         state["offer"] = self.features[self._offered(state)]
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = self._check_action(tensordict, 2, "1 to ask and 0 to skip")
         index = self._offered(tensordict)
         going_on = (tensordict["n_asked"] < self.budget) & (tensordict["n_offered"] < self.n_offers)
-        asks = (tensordict["action"] == 1).unsqueeze(-1)
+        asks = (action == 1).unsqueeze(-1)
         state = self._ask(tensordict, index, (asks & going_on).squeeze(-1))
         state["n_offered"] = state["n_offered"] + going_on
         self._observe(state)

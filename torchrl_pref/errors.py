@@ -31,6 +31,20 @@ def check_count(name: str, value: Any, minimum: int) -> int:
     return value
 
 
+def check_type(name: str, value: Any, kind: type, example: str) -> None:
+    """Refuse a value that is not an object of ``kind``.
+
+    Raises:
+        InputError: it is not.
+    """
+    if not isinstance(value, kind):
+        article = "an" if kind.__name__[0] in "AEIO" else "a"
+        raise InputError(
+            f"{name} of type {type(value).__name__}: expected {article} {kind.__name__}, such as "
+            f"{example}"
+        )
+
+
 def check_seed(name: str, value: Any) -> int:
     """Return ``value`` if it is a whole number from 0 to 2³¹ - 1.
 
@@ -62,6 +76,18 @@ def check_positive(name: str, value: Any) -> float:
     number = not isinstance(value, bool) and isinstance(value, (int, float))
     if not number or not math.isfinite(value) or value <= 0:
         raise InputError(f"{name}={value!r}: expected a finite number above 0, such as {name}=1.0")
+    return float(value)
+
+
+def check_not_negative(name: str, value: Any) -> float:
+    """Return ``value`` as a float if it is a finite number of at least zero.
+
+    Raises:
+        InputError: it is not.
+    """
+    number = not isinstance(value, bool) and isinstance(value, (int, float))
+    if not number or not math.isfinite(value) or value < 0:
+        raise InputError(f"{name}={value!r}: expected a finite number of at least 0")
     return float(value)
 
 

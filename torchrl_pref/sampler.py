@@ -148,7 +148,8 @@ def _tensor_move(samples: Tensor, poles: Tensor, uniform: Tensor, target: Target
     angle = torch.zeros_like(pole_angle)
     threshold = log_density(angle) + torch.log1p(-level)
     threshold = threshold.clamp(min=torch.finfo(threshold.dtype).min)  # the impossible stays below
-    arc = (ARC * poles.norm(dim=-1)).clamp(max=2 * math.pi)
+    # Of two features there is but one circle, and going round it reaches every mode.
+    arc = (ARC * poles.norm(dim=-1)).clamp(min=0 if meridians else 2 * math.pi, max=2 * math.pi)
     high = place * arc
     low = high - arc
     found = torch.zeros_like(angle, dtype=torch.bool)

@@ -143,7 +143,8 @@ def _aim(
             for m in range(first, last):
                 along[m] += ahead * places[d, m]
         length = math.sqrt(square)
-        width = min(arc * length, 2 * math.pi)
+        # Of two features there is but one circle, and going round it reaches every mode.
+        width = min(arc * length, 2 * math.pi) if n_features > 2 else 2 * math.pi
         for m in range(first, last):
             height[m] = max(math.sqrt(max(square - along[m] * along[m], 0.0)), 1e-20)
             pole[0, m], pole[1, m] = along[m] / length, height[m] / length

@@ -16,7 +16,7 @@ from types import FrameType
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
 from torchrl.objectives import A2CLoss
@@ -26,9 +26,20 @@ from tqdm import tqdm
 
 from torchrl_pref.collection import Sessions
 from torchrl_pref.envs import FeedEnv, QueryEnv
-from torchrl_pref.errors import check_choice, check_count, check_positive, check_share
+from torchrl_pref.errors import (
+    check_choice,
+    check_count,
+    check_positive,
+    check_share,
+)
 from torchrl_pref.policies import Policy
 from torchrl_pref.progress import Progress, add_row, start_table
+from torchrl_pref.restore import (
+    restore_generator,
+    restore_optimizer,
+    restore_sessions,
+    restore_weights,
+)
 
 OF_EPISODES = {
     "train/alignment": ("metrics", "alignment"),
@@ -225,15 +236,20 @@ class Trainer:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on where :meth:`state_dict` was taken; the average is what the policy holds now."""
+        """Go on where :meth:`state_dict` was taken; the average is what the policy holds now.
+
+        Raises:
+            InputError: the state was taken of another run.
+        """
         self.start_average()
-        self.policy.weights.load_state_dict(state["weights"])
+        restore_weights(self.policy.weights, state["weights"])
         self.progress = Progress.of(state)
-        self.optimizer.load_state_dict(state["optimizer"])
-        now = TensorDict(state["sessions"], self.env.batch_size, device=self.env.device)
-        self.sessions.now.update(now)
-        self.env.generator.set_state(state["env_generator"])
-        torch.set_rng_state(state["global_generator"])
+        restore_optimizer(self.optimizer, state["optimizer"]["state"])
+        now = self.sessions.now
+        session = now.select(*self.env.state_spec.keys())
+        restore_sessions(now, state["sessions"], session, len(self.env.features))
+        restore_generator(self.env.generator, state["env_generator"])
+        restore_generator(torch.default_generator, state["global_generator"])
 
 
 def _episode_metrics(batch: TensorDictBase) -> dict[str, float]:

@@ -5,7 +5,7 @@ case many beliefs get the same answers, and their samples are held against the p
 importance sampling or by a walk (``tests/posterior.py``, which shares no code with the package).
 *Bias* is the distance of the mean over all samples from the posterior mean, in posterior standard
 deviations; *variance* is that of all samples about the posterior mean over that of the posterior.
-Cases beyond a bound (.02 either way) get four times the sessions, as chance alone can put one there.
+Cases beyond a bound (.02 either way) get four times the sessions, as chance can put one there.
 """
 
 from __future__ import annotations

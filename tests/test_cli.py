@@ -97,7 +97,7 @@ def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path: Path) -> None:
     process.send_signal(signal.SIGINT)
     output, _ = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert f"python train.py resume={folder}" in output
+    assert f"train.py resume={folder}" in output
     assert Checkpoint.load(folder).training["update"] > 0
 
 
@@ -322,7 +322,7 @@ def test_a_run_is_never_overwritten(tmp_path: Path) -> None:
     process = start("train.py", *TINY, f"hydra.run.dir={tmp_path}")
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 2
-    assert "holds a run already (train_pool.pt)" in errors
+    assert "holds a run already" in errors
     assert os.listdir(tmp_path) == ["train_pool.pt"]
 
 

@@ -193,7 +193,7 @@ def test_critic_steps_bring_the_critic_to_the_returns() -> None:
         constants = {"sessions": 32, "steps": None, "optimizer": "adam", "learning_rate": 0.001}
         settings = settings_of("query", critic_steps=critic_steps, warm_up=20, **constants)
         trainer, _ = trainer_of(settings)
-        for _ in range(8):
+        for _ in range(12):
             trainer.update(trainer.sessions.collect())
         batch = trainer.sessions.collect()  # whole sessions, from the first question to the last
         returns = batch["next", "episode_reward"][:, -1]

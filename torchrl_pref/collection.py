@@ -5,6 +5,8 @@ Shapes: B sessions side by side, T steps of each in a batch.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -37,6 +39,11 @@ class Sessions:
         self.now: TensorDictBase = env.reset()
         self.now["episode_reward"] = torch.zeros_like(self.now["remaining"][..., :1])
         self.now["step_count"] = torch.zeros_like(self.now["n_asked"])
+        self._state_keys = tuple(self.now.keys())
+
+    def state_dict(self) -> dict[str, Any]:
+        """The sessions as they stand, without what the policy wrote beside them."""
+        return self.now.select(*self._state_keys).to_dict()
 
     @torch.no_grad()
     def collect(self) -> TensorDict:

@@ -148,7 +148,8 @@ def _check_training(training: Any) -> None:
     fits = isinstance(history, dict) and all(name in history for name in CURVES)
     _expect(fits, "training.history", f"a dict of lists, {', '.join(CURVES)} among them")
     for name, values in history.items():
-        fits = type(name) is str and type(values) is list
+        fits = type(name) is str and re.fullmatch("[a-z]+/[a-z_]+", name) is not None
+        fits = fits and type(values) is list
         fits = fits and all(type(value) in NUMBER for value in values)
         _expect(fits, "training.history", "lists of numbers")
     lengths = {len(values) for values in history.values()}

@@ -230,7 +230,7 @@ class Trainer:
             **self.progress.state_dict(),
             "weights": self.policy.weights.state_dict(),
             "optimizer": self.optimizer.state_dict(),
-            "sessions": self.sessions.now.to_dict(),
+            "sessions": self.sessions.state_dict(),
             "env_generator": self.env.generator.get_state(),
             "global_generator": torch.get_rng_state(),
         }

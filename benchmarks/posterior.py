@@ -137,13 +137,13 @@ def measure(case: Case, sessions: int) -> Measured:
     """One case; four times the sessions where the first ones are beyond a bound."""
     gaps = history(case)
     exact = posterior(gaps.double().numpy(), case.tau)
-    measured = _compare(case, gaps, exact, sessions)
+    measured = compare(case, gaps, exact, sessions)
     if _is_beyond(measured):
-        measured = _compare(case, gaps, exact, 4 * sessions)
+        measured = compare(case, gaps, exact, 4 * sessions)
     return measured
 
 
-def _compare(case: Case, gaps: Tensor, exact: Posterior, sessions: int) -> Measured:
+def compare(case: Case, gaps: Tensor, exact: Posterior, sessions: int) -> Measured:
     """Beliefs that all get the answers with these gaps (H K-1 D), beside the posterior."""
     generator, belief = Generator().manual_seed(1), Belief(case.model)
     samples = belief.prior(sessions, case.features, generator)

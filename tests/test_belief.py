@@ -3,8 +3,10 @@ import math
 import pytest
 import torch
 from conftest import RESPONSE_MODELS
+from posterior import posterior
 from torch import Generator, Tensor
 
+from benchmarks.posterior import Case, compare, history
 from torchrl_pref.belief import Belief, feature_gaps, uniform_sphere
 from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel
 
@@ -97,24 +99,27 @@ def test_effective_sample_size_is_what_it_says(
     assert ((ess >= 1) & (ess <= 100)).all()
 
 
+@pytest.mark.parametrize(("n_features", "n_options"), [(4, 2), (5, 3), (10, 3)])
 @pytest.mark.parametrize("model", RESPONSE_MODELS, ids=str)
-def test_calibration(model: ResponseModel, generator: Generator) -> None:
+def test_calibration(
+    model: ResponseModel, n_features: int, n_options: int, generator: Generator
+) -> None:
     """Simulation-based calibration (Talts et al., 2018): the rank of the truth is uniform."""
-    sessions, budget, n_features = 2000, 8, 4
-    belief = Belief(model, samples=99, moves=8)
+    sessions, budget = 2000, 8
+    belief = Belief(model, samples=99)
     omega = uniform_sphere((sessions, n_features), generator)
     samples = belief.prior(sessions, n_features, generator)
     ess = torch.full((sessions,), 99.0)
-    gaps = torch.zeros(sessions, 0, 1, n_features)
+    gaps = torch.zeros(sessions, 0, n_options - 1, n_features)
     for _ in range(budget):
-        queries = torch.randn(sessions, 2, n_features, generator=generator)
+        queries = torch.randn(sessions, n_options, n_features, generator=generator)
         log_probs = model((queries @ omega.unsqueeze(-1)).squeeze(-1))
         answers = log_probs.exp().multinomial(1, generator=generator).squeeze(-1)
         newest = feature_gaps(queries, answers)
         samples, ess, _ = belief.update(samples, ess, gaps, newest, generator)
         gaps = torch.cat([gaps, newest.unsqueeze(1)], 1)
         # Hard answers never exclude the human who gave them.
-        returns = (gaps @ omega[:, None, :, None]).squeeze(-1)
+        returns = (gaps.flatten(1, 2) @ omega.unsqueeze(-1)).view(gaps.shape[:3])
         assert model.log_likelihood(returns).sum(-1).isfinite().all()
     assert samples.isfinite().all()
     for feature in range(n_features):
@@ -124,6 +129,49 @@ def test_calibration(model: ResponseModel, generator: Generator) -> None:
         # 9 degrees of freedom: 33.7 is exceeded once in 10,000. The samples of a session are not
         # independent, which widens it a little.
         assert chi_square < 33.7
+
+
+CASES = [
+    Case(2, 3, 4.5, "contradictory"),
+    Case(2, 2, None, "60 answers"),
+    Case(4, 5, 4.5, "surprising"),
+    Case(4, 5, 30.0, "surprising"),
+    Case(4, 2, 30.0, "gaps of 1e3"),
+    Case(4, 3, 4.5, "gaps of 1e-4"),
+    Case(6, 3, 4.5, "collinear"),
+    Case(8, 2, 4.5, "greedy"),
+    Case(8, 3, None, "random"),
+    Case(16, 2, 4.5, "greedy"),
+]
+
+
+@pytest.mark.parametrize("case", CASES, ids=str)
+def test_samples_agree_with_importance_sampling(case: Case) -> None:
+    """Over features, options, noise and odd histories; the benchmark has all of them."""
+    gaps = history(case)
+    exact = posterior(gaps.double().numpy(), case.tau)
+    found = compare(case, gaps, exact, 1000 if case.kind == "greedy" else 200)
+    assert exact.draws > 5000
+    assert found.bias < 0.01 + 3 * found.bias_error
+    assert abs(found.variance - 1) < 0.01 + 3 * found.variance_error
+    assert found.effective > 60
+
+
+def test_one_question_answered_both_ways_without_error_is_left_out(generator: Generator) -> None:
+    """It could hold on a plane of ties alone."""
+    belief, sessions = Belief(Optimal()), 200
+    queries = torch.randn(sessions, 3, 5, generator=generator)
+    samples, ess = belief.prior(sessions, 5, generator), torch.full((sessions,), 100.0)
+    gaps = torch.zeros(sessions, 0, 2, 5)
+    for answer, used in ((0, True), (1, False), (0, True), (2, False)):
+        newest = feature_gaps(queries, torch.full((sessions,), answer))
+        after = belief.update(samples, ess, gaps, newest, generator)
+        assert (after.used == used).all()
+        if used:
+            gaps = torch.cat([gaps, newest.unsqueeze(1)], 1)
+        else:
+            assert torch.equal(after.samples, samples)
+        samples, ess = after.samples, after.ess
 
 
 def test_contradicting_hard_answer_is_left_out(generator: Generator) -> None:

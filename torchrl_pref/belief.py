@@ -213,8 +213,10 @@ class Belief:
             staged[todo] = True
         used = slack == 0
         if staged.any():
-            agrees = model.agrees(_gaps(samples, answers[:, -1])).any(1)
-            used &= agrees | ~staged
+            # In float64, where one gap and its negative differ by nothing that counts.
+            gaps = _gaps(samples.double(), answers.double())
+            agrees = model.agrees(gaps[:, :, -1]) & (model.joint_log_likelihood(gaps) > -math.inf)
+            used &= agrees.any(1) | ~staged
             samples = torch.where(used[:, None, None], samples, before[0])
             inflation = torch.where(used, inflation, before[1])
         return samples, inflation, used

@@ -96,6 +96,22 @@ def detail_table(results: Results, style: str = "simple") -> str:
     return tabulate(rows, headers, tablefmt=style, disable_numparse=True)
 
 
+def few_samples(results: Results) -> list[str]:
+    """A line for each strategy whose belief has at times been worth under half of its samples."""
+    lines = []
+    for name, result in results.items():
+        shares = result.ess / result.ess[:, :1]  # of the prior's, which are independent
+        least = shares.amin(1)
+        if (least < 0.5).any():
+            count, worst = int((least < 0.5).sum()), result.ess[int(least.argmin())]
+            lines.append(
+                f"! {NAMES.get(name, name)}: in {count} of {len(least)} sessions the belief was worth "
+                f"under half of its samples (least: {worst.min():.0f} of {worst[0]:.0f}); raise "
+                "belief.samples, or trust these rows less"
+            )
+    return [*lines, ""] if lines else []
+
+
 def _difference(paired: Tensor) -> str:
     """Mean and interval of a paired difference."""
     return signed(float(paired.mean()), bootstrap_interval(paired))
@@ -176,7 +192,7 @@ def write_report(folder: Path, panels: Mapping[str, Results]) -> None:
         n_humans = len(next(iter(results.values())).asked)
         heading = f"{title}, {n_humans} humans: alignment after so many queries"
         tables += [heading, "", alignment_table(results), ""]
-        tables += ["after the last query", "", detail_table(results), ""]
+        tables += ["after the last query", "", detail_table(results), "", *few_samples(results)]
     text = "\n".join(tables)
     write_text(folder / "tables.txt", text)
     write_curves(panels, folder / "curves.csv")

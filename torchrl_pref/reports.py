@@ -105,8 +105,8 @@ def few_samples(results: Results) -> list[str]:
         if (least < 0.5).any():
             count, worst = int((least < 0.5).sum()), result.ess[int(least.argmin())]
             lines.append(
-                f"! {NAMES.get(name, name)}: in {count} of {len(least)} sessions the belief was worth "
-                f"under half of its samples (least: {worst.min():.0f} of {worst[0]:.0f}); raise "
+                f"! {NAMES.get(name, name)}: in {count} of {len(least)} sessions the belief was "
+                f"worth under half of its samples (least: {worst.min():.0f} of {worst[0]:.0f}); raise "
                 "belief.samples, or trust these rows less"
             )
     return [*lines, ""] if lines else []

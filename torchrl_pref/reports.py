@@ -106,8 +106,8 @@ def few_samples(results: Results) -> list[str]:
             count, worst = int((least < 0.5).sum()), result.ess[int(least.argmin())]
             lines.append(
                 f"! {NAMES.get(name, name)}: in {count} of {len(least)} sessions the belief was "
-                f"worth under half of its samples (least: {worst.min():.0f} of {worst[0]:.0f}); raise "
-                "belief.samples, or trust these rows less"
+                f"worth under half of its samples (least: {worst.min():.0f} of {worst[0]:.0f}); "
+                "raise belief.samples, or trust these rows less"
             )
     return [*lines, ""] if lines else []
 

@@ -272,13 +272,18 @@ class Belief:
 
     def _next_slack(self, gaps: Tensor, slack: Tensor, log_now: Tensor) -> Tensor:
         """(S), the smallest slack that keeps enough of the samples effective."""
-        # At this slack every sample agrees, so the weights differ by a factor of at most K.
-        start = torch.minimum(slack, (-gaps).amax((1, 2)).clamp(min=0))
-        return _furthest(
-            start,
-            torch.zeros_like(start),
-            lambda to: kish_share(self._log_weights(gaps, to, log_now)) >= MIN_SHARE,
-        )
+        result = torch.zeros_like(slack)
+        few = kish_share(self._log_weights(gaps, result, log_now)) < MIN_SHARE
+        if few.any():
+            gaps, log_now = gaps[few], log_now[few]
+            # At this slack every sample agrees, so the weights differ by a factor of at most K.
+            start = torch.minimum(slack[few], (-gaps).amax((1, 2)).clamp(min=0))
+            result[few] = _furthest(
+                start,
+                torch.zeros_like(start),
+                lambda to: kish_share(self._log_weights(gaps, to, log_now)) >= MIN_SHARE,
+            )
+        return result
 
     def _resample_move(
         self,

@@ -6,7 +6,7 @@ process forked from a warm one, in a folder of its own, under limits of time and
 legal after all: they are stopped where their work would start. A few of the refused are run again
 as processes of their own, which must say the same.
 
-    python benchmarks/bad_settings.py               all of them, about ten minutes
+    python benchmarks/bad_settings.py               all: 20 minutes of CPU; Ctrl-C ends it early
     python benchmarks/bad_settings.py --sample 200  a random sample
 """
 
@@ -20,6 +20,7 @@ sys.path[0] = str(ROOT)  # not benchmarks, whose select.py would be found before
 
 import argparse
 import collections
+import contextlib
 import functools
 import os
 import random
@@ -399,11 +400,12 @@ def main() -> None:
     if typed.sample is not None:
         commands = luck.sample(commands, typed.sample)
     results = []
-    for script, arguments in commands:
-        results.append(result := run_forked(script, arguments))
-        if result.outcome in (*FAULTS, typed.show):
-            line = shlex.join([f"{script}.py", *arguments])
-            print(f"{result.outcome}: {line[:300]}\n    {result.errors[-600:]!r}", flush=True)
+    with contextlib.suppress(KeyboardInterrupt):  # then what has run is counted
+        for script, arguments in commands:
+            results.append(result := run_forked(script, arguments))
+            if result.outcome in (*FAULTS, typed.show):
+                line = shlex.join([f"{script}.py", *arguments])
+                print(f"{result.outcome}: {line[:300]}\n    {result.errors[-600:]!r}", flush=True)
     counts = collections.Counter(result.outcome for result in results)
     print(f"{len(results)} commands")
     for outcome in ("refused", "started", "answered", *FAULTS):

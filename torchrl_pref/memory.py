@@ -115,7 +115,7 @@ def _belief_parts(settings: dict[str, Any], n_options: int, n_features: int) -> 
     keys = ("belief.samples", "setup.budget", "pool.options")
     yield Part("the likelihood of the answers", answers, keys)
     if settings["objective"] == "entropy":
-        distances = 12.0 * sessions * samples**2
+        distances = 8.0 * sessions * samples**2
         yield Part("objective=entropy", distances, ("belief.samples", "evaluation.humans"))
 
 

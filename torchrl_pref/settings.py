@@ -178,7 +178,7 @@ def _check_keys(
         if key not in checks:
             raise InputError(
                 f"{key}={given[key]!r}: there is no such key here, with {_chosen(settings)}; "
-                f"remove {key}, --help lists the keys"
+                f"remove {key}, or the experiment that sets it; --help lists the keys"
             )
     for key, check in checks.items():
         if key not in given:

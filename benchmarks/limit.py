@@ -2,7 +2,7 @@
 
 ``python benchmarks/limit.py``. Scoring N queries under M samples takes a model of each of N·M
 answers; the ceiling is one ``exp`` and one ``log`` over N·M numbers that lie in the cache, timed in
-the same run. The belief's Markov step evaluates H answers for each of S·M samples a few times over;
+the same run. A move of the belief evaluates H answers for each of S·M samples a few times over;
 its ceiling is one ``exp`` and one ``log`` for each evaluation that it made. ``--compile`` adds
 ``torch.compile``.
 """
@@ -22,18 +22,13 @@ from torch import Generator, Tensor
 
 from benchmarks import common
 from torchrl_pref.acquisition import information_gain, predict_answers, score_queries
-from torchrl_pref.belief import (
-    Belief,
-    covariance_of,
-    feature_gaps,
-    orthonormal,
-    uniform_sphere,
-)
-from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel
-from torchrl_pref.sampler import ARC, MAX_SHRINKS, compiled_constants
-from torchrl_pref.sampler_cpu import compiled_step
+from torchrl_pref.belief import Belief, feature_gaps, uniform_sphere
+from torchrl_pref.resampling import GROUPS
+from torchrl_pref.resampling_cpu import compiled_moves
+from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel, compiled_constants
+from torchrl_pref.sampler import ARC, MAX_SHRINKS
 
-SESSIONS = 100
+SESSIONS, MOVES = 100, 4
 
 
 def main() -> None:
@@ -116,7 +111,7 @@ def _compiled(
 
 
 def _moving(model: ResponseModel, n_answers: int, repeats: int) -> common.Row:
-    """One Markov step of the belief after so many answers."""
+    """A round of moves of the belief after so many answers, and all that belongs to it."""
     generator = Generator().manual_seed(0)
     pool = common.normalised_pool().features
     omega = uniform_sphere((SESSIONS, pool.shape[-1]), generator)
@@ -130,25 +125,24 @@ def _moving(model: ResponseModel, n_answers: int, repeats: int) -> common.Row:
         newest = feature_gaps(queries, answers)
         samples, ess, _ = belief.update(samples, ess, gaps, newest, generator)
         gaps = torch.cat([gaps, newest.unsqueeze(1)], 1)
-    scale = torch.linalg.cholesky(covariance_of(samples))
-    poles = orthonormal(1, samples.shape, generator)[0] @ scale.mT
-    slack = torch.zeros(SESSIONS)
-    uniform = torch.rand((*samples.shape[:2], 2 + MAX_SHRINKS), generator=generator)
-
+    normal = torch.randn((SESSIONS, MOVES, pool.shape[-1]), generator=generator)
+    slack, power = torch.zeros(SESSIONS), torch.ones(SESSIONS)
+    uniform = torch.rand((MOVES, *samples.shape[:2], 2 + MAX_SHRINKS), generator=generator)
     constants = compiled_constants(model)
     assert constants is not None
 
-    def step(shrinks: int = MAX_SHRINKS) -> Tensor:
-        given = samples, poles, gaps, slack, uniform[..., : 2 + shrinks]
-        return compiled_step(*given, ARC, *constants)
+    def step(shrinks: int = MAX_SHRINKS, moves: int = MOVES) -> Tensor:
+        luck = normal[:, :moves], uniform[:moves, ..., : 2 + shrinks]
+        given = samples, samples, *luck, gaps, slack, power
+        return compiled_moves(*given, GROUPS, ARC, *constants)[0]
 
     # A sample that has not moved after so many shrinks needs one more evaluation.
-    unmoved = sum((step(n) - samples).norm(dim=-1) < 1e-6 for n in range(MAX_SHRINKS))
-    evaluated = n_answers * int((1 + unmoved).sum())
+    unmoved = sum((step(n, 1) - samples).norm(dim=-1) < 1e-6 for n in range(MAX_SHRINKS))
+    evaluated = MOVES * n_answers * int((1 + unmoved).sum())
     seconds = common.paired({"ceiling": _ceiling(evaluated, "cpu"), "step": step}, repeats)
     kind = "soft" if isinstance(model, Boltzmann) else "hard"
     return {
-        "kernel": f"belief step, {kind}, H={n_answers}, S={SESSIONS}",
+        "kernel": f"belief, {MOVES} moves, {kind}, H={n_answers}, S={SESSIONS}",
         "elements": evaluated,
         "CPU ms": 1000 * seconds["step"],
         "ceiling ms": 1000 * seconds["ceiling"],

@@ -20,8 +20,8 @@ from torchrl_pref.resampling import (
     tensor_resample,
 )
 from torchrl_pref.resampling_cpu import compiled_moves, compiled_resample
-from torchrl_pref.responses import Boltzmann, ResponseModel
-from torchrl_pref.sampler import ARC, MAX_SHRINKS, Target, compiled_constants, tensor_moves
+from torchrl_pref.responses import Boltzmann, ResponseModel, compiled_constants
+from torchrl_pref.sampler import ARC, MAX_SHRINKS, Target, tensor_moves
 
 
 @pytest.mark.parametrize("power", [1.0, 0.3])

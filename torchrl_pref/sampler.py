@@ -29,7 +29,7 @@ from torchrl_pref.resampling import (
     spread_of_others,
 )
 from torchrl_pref.resampling_cpu import compiled_moves
-from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel
+from torchrl_pref.responses import ResponseModel, compiled_constants
 
 ARC = 32.0
 """Length of the arc that is searched, in standard deviations of the posterior along it. A short
@@ -92,15 +92,6 @@ def round_of_moves(
         return compiled_moves(*given, min(GROUPS, n_samples), ARC, *constants)
     moved = tensor_moves(samples, normal, uniform, target)
     return moved, explained_share(start, moved)
-
-
-def compiled_constants(response_model: ResponseModel) -> tuple[float, float] | None:
-    """What ``compiled_moves`` knows a model by: tau and tolerance; None for others."""
-    if isinstance(response_model, Boltzmann):
-        return response_model.tau, 0.0
-    if isinstance(response_model, Optimal):
-        return math.inf, response_model.tolerance
-    return None
 
 
 def tensor_moves(samples: Tensor, normal: Tensor, uniform: Tensor, target: Target) -> Tensor:

@@ -23,10 +23,10 @@ from torch import Generator, Tensor
 from benchmarks import common
 from torchrl_pref.acquisition import information_gain, predict_answers, score_queries
 from torchrl_pref.belief import Belief, feature_gaps, uniform_sphere
-from torchrl_pref.resampling import GROUPS
-from torchrl_pref.resampling_cpu import compiled_moves
+from torchrl_pref.resampling import poles_of
 from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel, compiled_constants
 from torchrl_pref.sampler import ARC, MAX_SHRINKS
+from torchrl_pref.sampler_cpu import compiled_moves
 
 SESSIONS, MOVES = 100, 4
 
@@ -132,9 +132,9 @@ def _moving(model: ResponseModel, n_answers: int, repeats: int) -> common.Row:
     assert constants is not None
 
     def step(shrinks: int = MAX_SHRINKS, moves: int = MOVES) -> Tensor:
-        luck = normal[:, :moves], uniform[:moves, ..., : 2 + shrinks]
-        given = samples, samples, *luck, gaps, slack, power
-        return compiled_moves(*given, GROUPS, ARC, *constants)[0]
+        poles = poles_of(samples, normal[:, :moves])
+        luck = uniform[:moves, ..., : 2 + shrinks]
+        return compiled_moves(samples, poles, luck, gaps, slack, power, ARC, *constants)
 
     # A sample that has not moved after so many shrinks needs one more evaluation.
     unmoved = sum((step(n, 1) - samples).norm(dim=-1) < 1e-6 for n in range(MAX_SHRINKS))

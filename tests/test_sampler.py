@@ -15,13 +15,17 @@ from torchrl_pref.resampling import (
     frames_of,
     group_of,
     kish_share,
+    poles_of,
     resample,
     spread_of_others,
+    tensor_poles,
     tensor_resample,
+    tensor_share,
 )
-from torchrl_pref.resampling_cpu import compiled_moves, compiled_resample
+from torchrl_pref.resampling_cpu import compiled_resample
 from torchrl_pref.responses import Boltzmann, ResponseModel, compiled_constants
 from torchrl_pref.sampler import ARC, MAX_SHRINKS, Target, tensor_moves
+from torchrl_pref.sampler_cpu import compiled_moves
 
 
 @pytest.mark.parametrize("power", [1.0, 0.3])
@@ -43,19 +47,23 @@ def test_compiled_moves_go_where_those_in_tensors_do(
         gaps[:, h] = newest  # until then a row of zeros
         if h in (0, 4, 8):
             normal = torch.randn(sessions, 1, n_features, generator=generator)
+            poles = poles_of(samples, normal)
             uniform = torch.rand(1, sessions, 100, 2 + MAX_SHRINKS, generator=generator)
             slack = torch.rand(sessions, generator=generator) / 10
             target = Target(gaps, slack, torch.full((sessions,), power), model)
             constants = compiled_constants(model)
             assert constants is not None
-            given = samples, samples, normal, uniform, *target[:3], GROUPS, ARC, *constants
-            compiled, explained = compiled_moves(*given)
-            close = (compiled - tensor_moves(samples, normal, uniform, target)).norm(dim=-1) < 1e-3
+            compiled = compiled_moves(samples, poles, uniform, *target[:3], ARC, *constants)
+            close = (compiled - tensor_moves(samples, poles, uniform, target)).norm(dim=-1) < 1e-3
             # A proposal at the very edge of its slice may be judged differently.
             assert close.float().mean() > 0.99
             moved = (compiled - samples).norm(dim=-1)
             assert (moved > 1e-3 * samples.std(1).norm()).float().mean() > 0.8
-            assert torch.allclose(explained, explained_share(samples, compiled), atol=1e-3)
+            lengths = poles.norm(dim=-1, keepdim=True)
+            difference = (poles - tensor_poles(samples, normal)) / lengths
+            assert difference.norm(dim=-1).median() < 1e-3
+            shares = explained_share(samples, compiled), tensor_share(samples, compiled)
+            assert torch.allclose(*shares, atol=1e-2)
 
 
 @pytest.mark.parametrize("model", RESPONSE_MODELS, ids=str)
@@ -63,7 +71,9 @@ def test_moves_in_tensors_stay_on_their_device(model: ResponseModel) -> None:
     """``meta`` stands for a GPU: nothing is computed, but devices must not be mixed."""
     shapes = (5, 30, 4), (5, 6, 4), (6, 5, 30, 2 + MAX_SHRINKS), (5, 7, 1, 4), (5,), (5,)
     samples, normal, uniform, *rest = (torch.empty(shape, device="meta") for shape in shapes)
-    moved = tensor_moves(samples, normal, uniform, Target(*rest, model))
+    poles = poles_of(samples, normal)
+    moved = tensor_moves(samples, poles, uniform, Target(*rest, model))
+    assert explained_share(samples, moved).device.type == "meta"
     assert moved.device.type == "meta"
     assert moved.shape == shapes[0]
 

@@ -1,7 +1,9 @@
 """Functions compiled by Numba for the CPU, whose machine code is kept from one process to the next.
 
 It is kept in ``NUMBA_CACHE_DIR`` where that is set, else in ``__pycache__`` beside the source, else
-in the user's cache; where none of these can be written, each process compiles anew.
+in the user's cache; where none of these can be written, each process compiles anew. What is kept is
+made anew when its own file changes and not when another does: a compiled function calls only those
+of its own file.
 """
 
 from __future__ import annotations

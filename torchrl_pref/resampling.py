@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Generator, Tensor
 
-from torchrl_pref.resampling_cpu import compiled_resample
+from torchrl_pref.resampling_cpu import compiled_poles, compiled_resample, compiled_share
 
 GROUPS = 10
 """Samples move in directions drawn from the spread of the other groups: of nine tenths of them."""
@@ -113,12 +113,35 @@ def frames_of(normal: Tensor) -> Tensor:
     return torch.cat(frames, 1)
 
 
+def poles_of(samples: Tensor, normal: Tensor) -> Tensor:
+    """Directions of moves, from the spread of samples (S M D) and normal numbers (S V D).
+
+    Returns:
+        (V S P D), for each group of samples as long as a Gaussian with the covariance of the other
+        samples is wide in that direction.
+    """
+    if samples.is_cpu:
+        return compiled_poles(samples, normal, min(GROUPS, samples.shape[1]))
+    return tensor_poles(samples, normal)
+
+
+def tensor_poles(samples: Tensor, normal: Tensor) -> Tensor:
+    """:func:`poles_of` in tensors."""
+    poles = frames_of(normal) @ spread_of_others(samples).flatten(1, 2).mT
+    return poles.unflatten(2, (-1, samples.shape[2])).transpose(0, 1)
+
+
 def explained_share(before: Tensor, after: Tensor) -> Tensor:
     """How much of the variance of samples (S M D) their places before the moves explain, (S).
 
     The coefficient of determination of a linear regression, adjusted for chance and summed over
     features: 0 where the moves have made them forget.
     """
+    return (compiled_share if before.is_cpu else tensor_share)(before, after)
+
+
+def tensor_share(before: Tensor, after: Tensor) -> Tensor:
+    """:func:`explained_share` in tensors."""
     n_samples, n_features = before.shape[1:]
     before = before - before.mean(1, keepdim=True)
     after = after - after.mean(1, keepdim=True)

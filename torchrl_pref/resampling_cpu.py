@@ -1,9 +1,8 @@
-"""The step of the belief compiled by Numba for the CPU: ``resampling.py`` and the moves in one.
+"""What is in ``resampling.py``, compiled by Numba for the CPU: one session after the other.
 
 For one session torch would spend more time on starting its operations than on the work itself.
 
-Shapes: S sessions, M samples, H answers, K options per query, D features, V moves, P groups of
-samples, U uniforms of a move.
+Shapes: S sessions, M samples, D features, V moves, P groups of samples.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ import torch
 from torch import Tensor
 
 from torchrl_pref.compiled import compiled
-from torchrl_pref.sampler_cpu import move_session, rows_of
 
 Array = np.ndarray[Any, np.dtype[Any]]
 
@@ -32,41 +30,19 @@ def compiled_resample(
     return copies, factor
 
 
-def compiled_moves(
-    start: Tensor,
-    samples: Tensor,
-    normal: Tensor,
-    uniform: Tensor,
-    answers: Tensor,
-    slack: Tensor,
-    power: Tensor,
-    groups: int,
-    arc: float,
-    tau: float,
-    tolerance: float,
-) -> tuple[Tensor, Tensor]:
-    """One round of moves, for Boltzmann and optimal humans, with its random numbers given.
+def compiled_poles(samples: Tensor, normal: Tensor, groups: int) -> Tensor:
+    """``resampling.poles_of`` from samples (S M D) and normal numbers (S V D): (V S P D)."""
+    n_sessions, n_moves, n_features = normal.shape
+    poles = samples.new_empty(n_moves, n_sessions, groups, n_features)
+    _aim_sessions(*(t.contiguous().numpy() for t in (samples, normal, poles)))
+    return poles
 
-    Args:
-        start: (S M D), where the samples were before any moves.
-        samples: (S M D), where they are.
-        normal: (S V D), of which directions are made.
-        uniform: (V S M U), in [0, 1): two, and one for each shrink.
-        answers: (S H K-1 D), feature gaps.
-        slack, power: (S), see ``sampler.great_circle_moves``.
-        groups: P.
-        arc: length of the arc that is searched, in lengths of the pole.
-        tau: what the gaps are multiplied by; infinite for answers without error.
-        tolerance: of answers without error: gaps this small are ties.
 
-    Returns:
-        Samples (S M D), and how much of their variance ``start`` explains (S).
-    """
-    moved = torch.empty_like(samples, memory_format=torch.contiguous_format)
-    explained = torch.empty_like(slack)
-    given = start, samples, normal, uniform, answers, slack, power, moved, explained
-    _move_sessions(*(t.contiguous().numpy() for t in given), groups, arc, tau, tolerance)
-    return moved, explained
+def compiled_share(before: Tensor, after: Tensor) -> Tensor:
+    """``resampling.explained_share`` of samples (S M D): (S)."""
+    share = before.new_empty(len(before))
+    _explain_sessions(*(t.contiguous().numpy() for t in (before, after, share)))
+    return share
 
 
 @compiled
@@ -105,25 +81,9 @@ def _resample_sessions(
 
 
 @compiled
-def _move_sessions(
-    start: Array,
-    samples: Array,
-    normal: Array,
-    uniform: Array,
-    answers: Array,
-    slack: Array,
-    power: Array,
-    moved: Array,
-    explained: Array,
-    n_groups: int,
-    arc: float,
-    tau: float,
-    tolerance: float,
-) -> None:
-    """Fill ``moved`` (S M D) and ``explained`` (S)."""
-    n_others, hard = answers.shape[2], math.isinf(tau)
-    n_moves, n_features = normal.shape[1:]
-    poles = np.empty((n_moves, n_groups, n_features))
+def _aim_sessions(samples: Array, normal: Array, poles: Array) -> None:
+    """Fill ``poles`` (V S P D)."""
+    n_moves, _, n_groups, n_features = poles.shape
     for s in range(len(samples)):
         frames = _frames(normal[s])
         spread = _spread_of_others(samples[s], n_groups)
@@ -133,11 +93,14 @@ def _move_sessions(
                     ahead = 0.0
                     for e in range(d + 1):
                         ahead += spread[p, d, e] * frames[v, e]
-                    poles[v, p, d] = ahead
-        rows, raised = rows_of(answers[s], slack[s], 1.0 if hard else tau)
-        given = rows, raised, float(power[s]), arc, n_others, hard, tolerance
-        move_session(samples[s], poles, uniform[:, s], moved[s], *given)
-        explained[s] = _explained_share(start[s], moved[s])
+                    poles[v, s, p, d] = ahead
+
+
+@compiled
+def _explain_sessions(before: Array, after: Array, share: Array) -> None:
+    """Fill ``share`` (S)."""
+    for s in range(len(share)):
+        share[s] = _explained_share(before[s], after[s])
 
 
 @compiled

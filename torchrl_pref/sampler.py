@@ -21,15 +21,9 @@ import torch
 from torch import Generator, Tensor
 from torch.nn import functional as F
 
-from torchrl_pref.resampling import (
-    GROUPS,
-    explained_share,
-    frames_of,
-    group_of,
-    spread_of_others,
-)
-from torchrl_pref.resampling_cpu import compiled_moves
+from torchrl_pref.resampling import explained_share, group_of, poles_of
 from torchrl_pref.responses import ResponseModel, compiled_constants
+from torchrl_pref.sampler_cpu import compiled_moves
 
 ARC = 32.0
 """Length of the arc that is searched, in standard deviations of the posterior along it. A short
@@ -86,26 +80,25 @@ def round_of_moves(
     normal = torch.randn((n_sessions, n_moves, n_features), generator=generator, device=device)
     size = (n_moves, n_sessions, n_samples, 2 + MAX_SHRINKS)
     uniform = torch.rand(size, generator=generator, device=device)
+    poles = poles_of(samples, normal)
     constants = compiled_constants(target.response_model)
     if samples.is_cpu and constants is not None:
-        given = start, samples, normal, uniform, target.answers, target.slack, target.power
-        return compiled_moves(*given, min(GROUPS, n_samples), ARC, *constants)
-    moved = tensor_moves(samples, normal, uniform, target)
+        answers, slack, power, _ = target
+        moved = compiled_moves(samples, poles, uniform, answers, slack, power, ARC, *constants)
+    else:
+        moved = tensor_moves(samples, poles, uniform, target)
     return moved, explained_share(start, moved)
 
 
-def tensor_moves(samples: Tensor, normal: Tensor, uniform: Tensor, target: Target) -> Tensor:
-    """:func:`round_of_moves` in tensors, with normal (S V D) and uniform (V S M U) numbers given.
+def tensor_moves(samples: Tensor, poles: Tensor, uniform: Tensor, target: Target) -> Tensor:
+    """:func:`round_of_moves` in tensors, with poles (V S P D) and uniforms (V S M U) given.
 
     Returns:
         (S M D), unit vectors.
     """
-    # As long as a Gaussian with this covariance is wide in the direction of the pole.
-    poles = frames_of(normal) @ spread_of_others(samples).flatten(1, 2).mT
-    poles = poles.unflatten(2, (-1, samples.shape[2]))
     group = group_of(samples.shape[1], poles.shape[2], samples.device)
-    for v, luck in enumerate(uniform):
-        samples = _tensor_move(samples, poles[:, v, group], luck, target)
+    for ahead, luck in zip(poles, uniform, strict=True):
+        samples = _tensor_move(samples, ahead[:, group], luck, target)
     return samples
 
 

@@ -17,14 +17,69 @@ import math
 from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from torchrl_pref.compiled import compiled
 
 Array = np.ndarray[Any, np.dtype[Any]]
 
 
+def compiled_moves(
+    samples: Tensor,
+    poles: Tensor,
+    uniform: Tensor,
+    answers: Tensor,
+    slack: Tensor,
+    power: Tensor,
+    arc: float,
+    tau: float,
+    tolerance: float,
+) -> Tensor:
+    """``sampler.tensor_moves`` for Boltzmann and optimal humans.
+
+    Args:
+        samples: (S M D).
+        poles: (V S P D).
+        uniform: (V S M U), in [0, 1): two, and one for each shrink.
+        answers: (S H K-1 D), feature gaps.
+        slack, power: (S), see ``sampler.Target``.
+        arc: length of the arc that is searched, in lengths of the pole.
+        tau: what the gaps are multiplied by; infinite for answers without error.
+        tolerance: of answers without error: gaps this small are ties.
+
+    Returns:
+        (S M D), unit vectors.
+    """
+    moved = torch.empty_like(samples, memory_format=torch.contiguous_format)
+    given = samples, poles, uniform, answers, slack, power, moved
+    _move_sessions(*(t.contiguous().numpy() for t in given), arc, tau, tolerance)
+    return moved
+
+
 @compiled
-def rows_of(answers: Array, slack: float, unit: float) -> tuple[Array, Array]:
+def _move_sessions(
+    samples: Array,
+    poles: Array,
+    uniform: Array,
+    answers: Array,
+    slack: Array,
+    power: Array,
+    moved: Array,
+    arc: float,
+    tau: float,
+    tolerance: float,
+) -> None:
+    """Fill ``moved`` (S M D)."""
+    n_others, hard = answers.shape[2], math.isinf(tau)
+    for s in range(len(samples)):
+        rows, raised = _rows_of(answers[s], slack[s], 1.0 if hard else tau)
+        given = rows, raised, float(power[s]), arc, n_others, hard, tolerance
+        _move_session(samples[s], poles[:, s], uniform[:, s], moved[s], *given)
+
+
+@compiled
+def _rows_of(answers: Array, slack: float, unit: float) -> tuple[Array, Array]:
     """Feature gaps (G D) of the answers (H K-1 D) that there are, in units of 1/tau, and by how
     much the return gaps are raised (G): those of the last answer by the slack."""
     n_answers, n_others, n_features = answers.shape
@@ -42,7 +97,7 @@ def rows_of(answers: Array, slack: float, unit: float) -> tuple[Array, Array]:
 
 
 @compiled
-def move_session(
+def _move_session(
     samples: Array,
     poles: Array,
     uniform: Array,

@@ -215,12 +215,18 @@ def test_sweeps_of_other_settings_do_not_mix(tmp_path: Path) -> None:
     assert (tmp_path / "1" / "summary.json").exists()
 
 
-def test_jobs_run_under_a_launcher(tmp_path: Path) -> None:
-    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
-    launcher = ["hydra/launcher=submitit_local", f"hydra.sweep.dir={tmp_path}"]
-    process = start("train.py", "-m", "setup=query", "tau=-1,2", *TINY, *launcher)
+@pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
+def test_jobs_run_under_a_launcher(launcher: str, tmp_path: Path) -> None:
+    chosen = [f"hydra/launcher={launcher}", f"hydra.sweep.dir={tmp_path}"]
+    process = start("train.py", "-m", "setup=query", "tau=-1,2", *TINY, *chosen)
     output, errors = process.communicate(timeout=120)
     assert process.returncode == 2
-    assert errors.startswith("error: job 1") or "job 0: failed" in errors
-    assert (tmp_path / "1" / "summary.json").exists()
+    assert "job 0: failed" in errors.splitlines()[-1]
     assert "tau=-1: expected" in output
+    assert (tmp_path / "1" / "summary.json").exists()
+    before = (tmp_path / "1" / "tables.txt").stat().st_mtime_ns
+    process = start("train.py", "-m", "setup=query", "tau=1,2", *TINY, *chosen)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 0, errors
+    assert (tmp_path / "1" / "tables.txt").stat().st_mtime_ns == before
+    assert [row.get("failed") for row in sweeps.write_table(tmp_path)] == [None, None]

@@ -14,43 +14,42 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, TextIO
 
-import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
+import typed
 from torchrl_pref import runs, sweeps
-from torchrl_pref.errors import InputError, check_count, one_line_errors
-
-SECTIONS = {"grid", "pool", "belief", "evaluation", "training", "setup", "policy"}
+from torchrl_pref.errors import InputError, one_line_errors
 
 
 class Terminated(KeyboardInterrupt):
     """SIGTERM, which stops a program as Ctrl-C does."""
 
 
-def main(job: Callable[[], Any]) -> None:
-    """Run a Hydra job; input that cannot be used ends it with one line and status 2."""
+def main(job: Callable[[], Any], check: Callable[[dict[str, Any]], None]) -> None:
+    """Run a Hydra job; input that cannot be used ends it with one line and status 2.
+
+    Args:
+        job: as decorated by Hydra.
+        check: raises an InputError for settings that the job cannot use; it is called before
+            anything is made for them.
+    """
     # Without this Hydra prints its own several lines and exits with status 1.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     # Python puts a script's folder on the path of the script alone; a launcher's workers need it.
     path = [str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])]
     os.environ["PYTHONPATH"] = os.pathsep.join(path)
     signal.signal(signal.SIGTERM, _terminate)
+    typed.Gate.check, typed.Gate.passed, typed.Gate.made = check, False, ()
     with unbroken_output(), one_line_errors():
         try:
-            with sweep_report():
+            with typed.refusals(), typed.checked_flags(), sweep_report():
                 job()
-        except (HydraException, OmegaConfBaseException) as error:
-            text = " ".join(str(error).split())
-            text = re.sub(
-                r"\.? (Config search path:|full_key:|To append to your config).*", "", text
-            )
-            raise InputError(f"{text}; --help lists the keys and their values") from None
         except KeyboardInterrupt as stop:
             print("\nstopped", file=sys.stderr)
             raise SystemExit(exit_status(stop)) from None
@@ -59,6 +58,8 @@ def main(job: Callable[[], Any]) -> None:
                 f"{error.filename}: the run folder cannot be written ({error.strerror}); "
                 "set hydra.run.dir to a folder that can be"
             ) from None
+        finally:
+            typed.discard_folders()
 
 
 def _terminate(number: int, frame: FrameType | None) -> None:
@@ -100,63 +101,11 @@ class _Unbroken:
         return written
 
 
-def plain_settings(config: DictConfig) -> dict[str, Any]:
-    """The composed configuration as plain values.
-
-    Raises:
-        InputError: a section was replaced by a value, or a group was renamed from within.
-    """
-    settings = OmegaConf.to_container(config, resolve=True)
-    assert isinstance(settings, dict)
-    choices = HydraConfig.get().runtime.choices
-    for section in SECTIONS & set(settings):
-        if not isinstance(settings[section], dict):
-            raise InputError(
-                f"{section}={settings[section]!r}: {section} is a section of keys and not a value; "
-                f"type {section}.<key>=<value>, --help lists them"
-            )
-    for group in ("setup", "policy"):
-        chosen = choices.get(group)
-        if chosen is not None and settings[group]["name"] != chosen:
-            name = settings[group]["name"]
-            raise InputError(
-                f"{group}.name={name!r}: type {group}={name} to choose another {group}"
-            )
-    return {str(key): value for key, value in settings.items()}
-
-
 def use_threads(settings: dict[str, Any]) -> None:
     """Set torch to the number of threads in the settings."""
-    torch.set_num_threads(check_count("threads", settings["threads"], 1))
+    import torch
 
-
-def typed_overrides() -> list[str]:
-    """The keys=values that the user typed."""
-    return list(HydraConfig.get().overrides.task)
-
-
-def was_typed(key: str) -> bool:
-    """Whether the user typed a value for a key."""
-    return any(override.split("=")[0].lstrip("+") == key for override in typed_overrides())
-
-
-def refuse_other_overrides(source: str, allowed: tuple[str, ...]) -> None:
-    """Refuse to ignore what the user typed where a checkpoint decides.
-
-    Args:
-        source: the key that names the checkpoint.
-        allowed: keys, or sections ending in a dot, that may be typed beside it.
-
-    Raises:
-        InputError: another key was typed.
-    """
-    for override in typed_overrides():
-        key = override.split("=")[0].lstrip("+~")
-        if key != source and not key.startswith(allowed):
-            raise InputError(
-                f"{override}: {source}=… brings its own settings and only "
-                f"{', '.join(allowed)} may be typed beside it; remove {key}, or drop {source}"
-            )
+    torch.set_num_threads(settings["threads"])
 
 
 def command(*arguments: str) -> str:
@@ -251,7 +200,7 @@ def do_job(work: Callable[[Path], float]) -> float:
         with unbroken_output(), one_line_errors():
             if in_sweep():
                 sweep = Path(os.path.abspath(HydraConfig.get().sweep.dir))
-                return sweeps.attempt(sweep, folder, typed_overrides(), lambda: work(folder))
+                return sweeps.attempt(sweep, folder, typed.typed_overrides(), lambda: work(folder))
             return work(folder)
     finally:
         discard_if_empty(folder)
@@ -274,15 +223,14 @@ def output_folder() -> Path:
 
 
 def discard_if_empty(folder: Path) -> None:
-    """Remove a default folder that the job left empty, and the dated ones around it.
+    """Remove the default folder of a sweep's job that left it empty, and the dated ones around it.
 
     A folder that the user named is theirs, and stays.
     """
-    try:
-        inside = folder.relative_to(Path.cwd())
-    except ValueError:
+    if not in_sweep() or not folder.is_relative_to(Path.cwd()):
         return
-    if inside.parts[0] in ("outputs", "multirun"):
+    inside = folder.relative_to(Path.cwd())
+    if inside.parts[:1] in (("outputs",), ("multirun",)):
         with contextlib.suppress(OSError):
             for path in (inside, *list(inside.parents)[:-1]):
                 path.rmdir()

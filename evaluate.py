@@ -1,6 +1,7 @@
 """Compare strategies on the same humans and rebuild the paper's figures.
 
-`python evaluate.py --help` lists the keys.
+`python evaluate.py --help` lists the keys. What takes long to import is imported where it is used,
+so that help and refusals come at once.
 """
 
 from __future__ import annotations
@@ -10,17 +11,22 @@ from collections.abc import Callable
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import hydra
 from omegaconf import DictConfig
 
 import app
-from torchrl_pref import comparison, experiment, heldout, heldout_report, reports, runs
-from torchrl_pref.checkpoint import FILE_NAME, Checkpoint
-from torchrl_pref.errors import InputError, check_choice, check_count, one_line_errors
-from torchrl_pref.pretrained import SEEDS, pretrained_checkpoint
-from torchrl_pref.queries import QueryPool
+import typed
+from torchrl_pref import runs
+from torchrl_pref.errors import InputError, one_line_errors
+from torchrl_pref.runs import CHECKPOINT
+from torchrl_pref.settings import check_evaluate_settings
+
+if TYPE_CHECKING:
+    from torchrl_pref.checkpoint import Checkpoint
+    from torchrl_pref.comparison import Panels
+    from torchrl_pref.progress import Progress
 
 PROTOCOL_KEYS = (
     "checkpoint",
@@ -38,9 +44,6 @@ PROTOCOL_KEYS = (
 )
 """What may be typed beside ``protocol``; the rest is the protocol's own."""
 
-Evaluated = tuple[comparison.Panels, dict[str, dict[str, list[float]]]]
-"""Panels of evaluations, and the training histories behind them."""
-
 
 @hydra.main(config_path="conf", config_name="evaluate", version_base="1.3")
 def job(config: DictConfig) -> None:
@@ -48,57 +51,60 @@ def job(config: DictConfig) -> None:
     folder = app.output_folder()
     try:
         with one_line_errors(), runs.claimed(folder):
-            if (folder / FILE_NAME).exists() or (folder / "config.yaml").exists():
+            if (folder / CHECKPOINT).exists() or (folder / "config.yaml").exists():
                 raise InputError(
                     f"{folder} holds a run, whose tables and figures would be overwritten; name "
                     "another folder by hydra.run.dir="
                 )
-            evaluate(app.plain_settings(config), folder)
+            settings = typed.plain_settings(config)
+            check(settings)
+            evaluate(settings, folder)
     finally:
         app.discard_if_empty(folder)
 
 
-def evaluate(settings: dict[str, Any], folder: Path) -> None:
-    """What the settings ask for, reported in a folder."""
-    app.use_threads(settings)
-    named = settings["checkpoint"]
-    check_lists(settings)
-    if app.was_typed("objective"):
+def check(settings: dict[str, Any]) -> None:
+    """Refuse what cannot be evaluated.
+
+    Raises:
+        InputError: a setting is out of range, or was typed where something else decides.
+    """
+    if typed.was_typed("objective"):
         raise InputError(
             "objective=… is what a policy is trained for and changes nothing here; "
             "expected by train.py alone; remove it"
         )
-    if settings["protocol"] is not None:
-        check_choice("protocol", settings["protocol"], ("heldout",))
-        app.refuse_other_overrides("protocol", PROTOCOL_KEYS)
-        run_heldout(settings, folder)
-    elif "policy" in settings:
-        check_choice("policy", settings["policy"]["name"], ("pretrained",))
-        if named is not None:
+    if settings.get("protocol") is not None:
+        typed.refuse_other_overrides("protocol", PROTOCOL_KEYS)
+    elif settings.get("checkpoint") is not None:
+        if "policy" in settings:
             raise InputError(
                 "policy=pretrained and checkpoint=… name two policies; expected one of "
                 "them; pretrained policies are files too: checkpoint=[a.pt,b.pt]"
             )
-        panels = evaluate_taus(settings, partial(pretrained_for, settings))
-        reports.write_report(folder, panels, {})
-    elif named is None:
-        reports.write_report(folder, evaluate_taus(settings, lambda tau: {}), {})
-    else:
         allowed = ("evaluation.", "pool.test", "device", "threads", "hydra.")
-        app.refuse_other_overrides("checkpoint", allowed)
+        typed.refuse_other_overrides("checkpoint", allowed)
+    check_evaluate_settings(settings)
+
+
+def evaluate(settings: dict[str, Any], folder: Path) -> None:
+    """What the settings ask for, reported in a folder."""
+    from torchrl_pref import reports, training_report
+
+    app.use_threads(settings)
+    named = settings["checkpoint"]
+    if settings["protocol"] is not None:
+        run_heldout(settings, folder)
+    elif "policy" in settings:
+        panels = evaluate_taus(settings, partial(pretrained_for, settings))
+        reports.write_report(folder, panels)
+    elif named is None:
+        reports.write_report(folder, evaluate_taus(settings, lambda tau: {}))
+    else:
         paths = find_checkpoints([str(name) for name in listed(named)])
-        reports.write_report(folder, *evaluate_checkpoints(settings, paths))
-
-
-def check_lists(settings: dict[str, Any]) -> None:
-    """Refuse empty lists where at least one thing has to be evaluated.
-
-    Raises:
-        InputError: ``tau`` or ``checkpoint`` is empty.
-    """
-    for key, example in (("tau", "[noisy,optimal]"), ("checkpoint", "outputs/<run>")):
-        if settings[key] == []:
-            raise InputError(f"{key}=[]: expected at least one, such as {key}={example}")
+        panels, trained = evaluate_checkpoints(settings, paths)
+        reports.write_report(folder, panels)
+        training_report.write_training(folder, trained)
 
 
 def listed(value: Any) -> list[Any]:
@@ -108,12 +114,14 @@ def listed(value: Any) -> list[Any]:
 
 def evaluate_taus(
     settings: dict[str, Any], learned_for: Callable[[Any], dict[str, Checkpoint]]
-) -> comparison.Panels:
+) -> Panels:
     """The baselines and what was learned for each tau, a panel each."""
+    from torchrl_pref import comparison, experiment
+
     pools = experiment.make_pools(settings)
     taus = listed(settings["tau"])
     tasks = [(experiment.make_task(*pools, tau), learned_for(tau)) for tau in taus]
-    panels: comparison.Panels = {}
+    panels: Panels = {}
     for task, learned in tasks:
         panels |= comparison.evaluate_panels(settings, task, learned)
     return panels
@@ -121,14 +129,21 @@ def evaluate_taus(
 
 def pretrained_for(settings: dict[str, Any], tau: Any) -> dict[str, Checkpoint]:
     """The policy that comes with the package for a tau, under the settings of this evaluation."""
+    from torchrl_pref.comparison import label_of
+    from torchrl_pref.pretrained import pretrained_checkpoint
+
     checkpoint = pretrained_checkpoint(settings["setup"]["name"], tau)
     for section in ("setup", "belief", "skip", "tau_spread", "device"):
         checkpoint.settings[section] = settings[section]
-    return {f"{comparison.label_of(checkpoint.settings)} (pretrained)": checkpoint}
+    return {f"{label_of(checkpoint.settings)} (pretrained)": checkpoint}
 
 
 def run_heldout(settings: dict[str, Any], folder: Path) -> None:
     """The held-out protocol, for checkpoints or for the policies that come with the package."""
+    from torchrl_pref import heldout, heldout_report
+    from torchrl_pref.checkpoint import Checkpoint
+    from torchrl_pref.pretrained import SEEDS, pretrained_checkpoint
+
     learned: dict[heldout.Cell, list[Checkpoint]] = {}
     if settings["checkpoint"] is None:
         for setup, tau in product(("query", "feed"), ("noisy", "optimal")):
@@ -140,8 +155,8 @@ def run_heldout(settings: dict[str, Any], folder: Path) -> None:
             checkpoint = Checkpoint.load(path)
             cell = heldout.Cell(checkpoint.settings["setup"]["name"], checkpoint.settings["tau"])
             learned.setdefault(cell, []).append(checkpoint)
-    workers = check_count("workers", settings["workers"], 1)
-    heldout_report.write_heldout(folder, heldout.run_protocol(settings, learned, workers))
+    results = heldout.run_protocol(settings, learned, settings["workers"])
+    heldout_report.write_heldout(folder, results)
 
 
 def find_checkpoints(named: list[str]) -> list[Path]:
@@ -152,18 +167,26 @@ def find_checkpoints(named: list[str]) -> list[Path]:
     """
     paths = []
     for name in map(Path, named):
-        found = [name.resolve()] if name.is_file() else sorted(name.resolve().rglob(FILE_NAME))
+        whole = Path(os.path.realpath(name))  # of a link to itself, too
+        found = [whole] if whole.is_file() else sorted(whole.rglob(CHECKPOINT))
         if not found:
             raise InputError(
-                f"checkpoint={name}: no {FILE_NAME} there; expected a checkpoint file, the folder "
+                f"checkpoint={name}: no {CHECKPOINT} there; expected a checkpoint file, the folder "
                 "of a run or of a sweep; check the path"
             )
         paths += found
     return paths
 
 
-def evaluate_checkpoints(settings: dict[str, Any], paths: list[Path]) -> Evaluated:
-    """Learned policies beside random and greedy, a panel for each kind of human."""
+def evaluate_checkpoints(
+    settings: dict[str, Any], paths: list[Path]
+) -> tuple[Panels, dict[str, Progress]]:
+    """Learned policies beside random and greedy, a panel for each kind of human, and the trainings
+    behind them."""
+    from torchrl_pref import comparison, experiment
+    from torchrl_pref.checkpoint import Checkpoint
+    from torchrl_pref.queries import QueryPool
+
     runs = []
     common = Path(os.path.commonpath([path.parent.parent for path in paths]))
     for path in paths:
@@ -172,22 +195,22 @@ def evaluate_checkpoints(settings: dict[str, Any], paths: list[Path]) -> Evaluat
         for section in ("evaluation", "device"):
             checkpoint.settings[section] = settings[section]
         pools = path.with_name("train_pool.pt"), path.with_name("test_pool.pt")
-        named = path.parent if path.name == FILE_NAME else path.with_suffix("")
+        named = path.parent if path.name == CHECKPOINT else path.with_suffix("")
         name = str(named.relative_to(common))
         runs.append((name, checkpoint, experiment.reload_task(checkpoint, *pools)))
-    panels: comparison.Panels = {}
+    panels: Panels = {}
     for panel_settings, task, learned in comparison.group_checkpoints(runs):
         test = None
         if settings["pool"]["test"] is not None:
             test = QueryPool.load(settings["pool"]["test"]).map_features(task.normalizer)
         panels |= comparison.evaluate_panels(panel_settings, task, learned, test)
     titles = [f"{comparison.label_of(c.settings)}, {task.title}" for _, c, task in runs]
-    histories = {}
+    trained = {}
     for title, (name, checkpoint, _) in zip(titles, runs, strict=True):
         unique = title if titles.count(title) == 1 else f"{title}, {name}"
-        histories[unique] = checkpoint.history
-    return panels, histories
+        trained[unique] = checkpoint.progress
+    return panels, trained
 
 
 if __name__ == "__main__":
-    app.main(job)
+    app.main(job, check)

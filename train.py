@@ -1,27 +1,35 @@
 """Train a policy to ask, then compare it with random and greedy on queries it never saw.
 
-`python train.py --help` lists the keys.
+`python train.py --help` lists the keys. What takes long to import is imported where it is used, so
+that help and refusals come at once.
 """
 
 from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import hydra
 from omegaconf import DictConfig, OmegaConf
 
 import app
-from torchrl_pref import comparison, experiment, reports, runs, sweeps
-from torchrl_pref.checkpoint import FILE_NAME, Checkpoint
+import typed
+from torchrl_pref import runs, sweeps
 from torchrl_pref.errors import InputError
-from torchrl_pref.training import Trainer
+from torchrl_pref.memory import check_memory
+from torchrl_pref.runs import CHECKPOINT
+from torchrl_pref.settings import check_run, check_train_settings
 from torchrl_pref.writing import write_text
+
+if TYPE_CHECKING:
+    from torchrl_pref.checkpoint import Checkpoint
+    from torchrl_pref.experiment import Task
+    from torchrl_pref.training import Trainer
 
 CONFIG = "config.yaml"
 POOLS = ("train_pool.pt", "test_pool.pt")
-RUN = (FILE_NAME, *POOLS, CONFIG)
+RUN = (CHECKPOINT, *POOLS, CONFIG)
 """The files by which a folder holds a run. The configuration comes first: from it the run can be
 started again where it was killed before its first checkpoint."""
 
@@ -32,13 +40,24 @@ def job(config: DictConfig) -> float:
     return app.do_job(partial(run, config))
 
 
+def check(settings: dict[str, Any]) -> None:
+    """Refuse what cannot be trained.
+
+    Raises:
+        InputError: a setting is out of range, or was typed where a checkpoint decides.
+    """
+    check_train_settings(settings)
+    if settings["resume"] is not None:
+        allowed = ("training.updates", "device", "threads", "hydra.")
+        typed.refuse_other_overrides("resume", allowed)
+
+
 def run(config: DictConfig, made: Path) -> float:
     """A new run in the folder made for it, or one to go on with, in its own."""
-    settings = app.plain_settings(config)
+    settings = typed.plain_settings(config)
+    check(settings)
     resume = settings.pop("resume")
     if resume is not None:
-        allowed = ("training.updates", "device", "threads", "hydra.")
-        app.refuse_other_overrides("resume", allowed)
         folder = run_folder(Path(str(resume)))
         with runs.claimed(folder):
             value = go_on(folder, settings)
@@ -67,13 +86,15 @@ def run_folder(path: Path) -> Path:
     Raises:
         InputError: there is none.
     """
+    from torchrl_pref.checkpoint import Checkpoint
+
     if path.is_file():
         check_trained(path, Checkpoint.load(path))
         path = path.parent
-    if not any((path / name).exists() for name in (FILE_NAME, CONFIG)):
+    if not any((path / name).exists() for name in (CHECKPOINT, CONFIG)):
         found = "holds no run" if path.is_dir() else "no such file or folder"
         raise InputError(
-            f"resume={path}: {found}; expected the folder of a run, with its {FILE_NAME} or "
+            f"resume={path}: {found}; expected the folder of a run, with its {CHECKPOINT} or "
             f"{CONFIG}; check the path, or start a new run there by hydra.run.dir="
         )
     return path.resolve()
@@ -126,7 +147,7 @@ def load_config(folder: Path) -> dict[str, Any]:
 
 def begin(folder: Path, settings: dict[str, Any]) -> float:
     """A new run in a folder, from the settings as typed."""
-    settings["overrides"] = app.typed_overrides()
+    settings["overrides"] = typed.typed_overrides()
     if settings["checkpoint"] is not None:
         settings["checkpoint"] = str(Path(str(settings["checkpoint"])).absolute())
     return start(folder, settings)
@@ -134,8 +155,12 @@ def begin(folder: Path, settings: dict[str, Any]) -> float:
 
 def start(folder: Path, settings: dict[str, Any]) -> float:
     """The first update of a run, and all that follow."""
+    from torchrl_pref import comparison, experiment
+    from torchrl_pref.checkpoint import Checkpoint
+
     app.use_threads(settings)
     pools = experiment.make_pools(settings)
+    check_memory(settings, *pools[0].features.shape)
     task = experiment.make_task(*pools, settings["tau"])
     trainer = experiment.make_trainer(settings, task)
     comparison.check_evaluation(settings)
@@ -153,17 +178,23 @@ def start(folder: Path, settings: dict[str, Any]) -> float:
         return train(folder, settings, task, trainer)
 
 
-def go_on(folder: Path, typed: dict[str, Any]) -> float:
+def go_on(folder: Path, new: dict[str, Any]) -> float:
     """An old run, from its last checkpoint or its start, with its own settings."""
-    checkpoint = Checkpoint.load(folder) if (folder / FILE_NAME).exists() else None
+    from torchrl_pref import experiment
+    from torchrl_pref.checkpoint import Checkpoint
+
+    checkpoint = Checkpoint.load(folder) if (folder / CHECKPOINT).exists() else None
     settings = load_config(folder) if checkpoint is None else checkpoint.settings
+    if isinstance(settings.get("evaluation"), dict):
+        settings["evaluation"].setdefault("during", 0)  # version 0.1.0 knew no such key
     for key in ("device", "threads"):
-        if app.was_typed(key):
-            settings[key] = typed[key]
-    if app.was_typed("training.updates"):
-        updates = settings["training"]["updates"] = typed["training"]["updates"]
+        if typed.was_typed(key):
+            settings[key] = new[key]
+    if typed.was_typed("training.updates"):
+        updates = settings["training"]["updates"] = new["training"]["updates"]
         others = [o for o in settings["overrides"] if not o.startswith("training.updates=")]
         settings["overrides"] = [*others, f"training.updates={updates}"]
+    check_run(settings)
     if checkpoint is None:
         print(f"{folder}: was stopped before its first checkpoint and starts again")
         return start(folder, settings)
@@ -193,22 +224,26 @@ def check_trained(path: Path, checkpoint: Checkpoint) -> None:
         )
 
 
-def train(folder: Path, settings: dict[str, Any], task: experiment.Task, trainer: Trainer) -> float:
+def train(folder: Path, settings: dict[str, Any], task: Task, trainer: Trainer) -> float:
     """Train, evaluate on the held-out pool, report."""
+    from torchrl_pref import comparison, experiment, reports, training_report
+    from torchrl_pref.learning_curve import LearningCurve
+
     setup = settings["setup"]["name"]
     print(f"{setup} setup, {task.title}, run folder {folder}")
 
     def save() -> None:
-        experiment.make_checkpoint(settings, task, trainer).save(folder / FILE_NAME)
+        experiment.make_checkpoint(settings, task, trainer).save(folder / CHECKPOINT)
 
-    trainer.run(folder, save)
+    trainer.run(folder, save, LearningCurve(settings, task, trainer).measure)
     label = comparison.label_of(settings)
     learned = {label: experiment.make_checkpoint(settings, task, trainer)}
     panels = comparison.evaluate_panels(settings, task, learned)
-    reports.write_report(folder, panels, {label: trainer.progress.history})
+    reports.write_report(folder, panels)
+    training_report.write_training(folder, {label: trainer.progress})
     held_out = next(iter(panels.values()))[label]
     return sweeps.write_summary(folder, settings["overrides"], held_out)
 
 
 if __name__ == "__main__":
-    app.main(job)
+    app.main(job, check)

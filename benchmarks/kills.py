@@ -142,9 +142,12 @@ def content(folder: Path) -> dict[str, Any]:
     """All that a run leaves and that is not a time."""
     checkpoint = Checkpoint.load(folder)
     training = dict(checkpoint.training)
-    training["history"] = {k: v for k, v in checkpoint.history.items() if "time/" not in k}
+    training["history"] = {k: v for k, v in checkpoint.progress.history.items() if "time/" not in k}
     tables = (folder / "tables.txt").read_text()
-    logs = sorted(path for path in (folder / "csv").rglob("*.csv") if path.parent.name != "time")
+    with (folder / "training.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    for row in rows:
+        row.pop("frames_per_second")
     names = {path.name for path in folder.iterdir()}
     return {
         "names": sorted(names),
@@ -152,7 +155,7 @@ def content(folder: Path) -> dict[str, Any]:
         "training": flat(training),
         "settings": flat(checkpoint.settings),
         "tables": re.sub(r"\S+$", "", tables, flags=re.M),  # the last column is a time
-        "logs": [list(csv.reader(path.open())) for path in logs],
+        "table": rows,
         **{name: (folder / name).read_text() for name in ("curves.csv", "summary.json")},
         "pools": [(folder / f"{name}_pool.pt").read_bytes() for name in ("train", "test")],
     }

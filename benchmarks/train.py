@@ -62,13 +62,12 @@ class Ours:
         env = make_env(n_envs)
         torch.manual_seed(0)
         self.trainer = Trainer(env, paper_policy(env), A2CSettings(**constants), seed=0)
-        self.batches = iter(self.trainer.collector)
 
     def advance(self, updates: int) -> list[int]:
         """Collect and update so often; the lengths of the sessions that ended meanwhile."""
         lengths: list[int] = []
         for _ in range(updates):
-            batch = next(self.batches)
+            batch = self.trainer.sessions.collect()
             self.trainer.update(batch)
             ended = batch["next", "done"]
             lengths += batch["next", "step_count"][ended].tolist()
@@ -113,7 +112,7 @@ def twin_arguments() -> tuple[Any, ...]:
     """What a twin is made with; all share one pool."""
     belief = Belief(Boltzmann(common.TAU))
     pool = common.normalised_pool().features.double().numpy()
-    return pool, common.TAU, belief.n_samples, belief.n_moves, BUDGET
+    return pool, common.TAU, belief.n_samples, 4, BUDGET
 
 
 def make_twin() -> Any:

@@ -8,20 +8,24 @@ import torchrl_pref
 PACKAGE = Path(torchrl_pref.__file__).parent
 
 LAYERS = [
-    {"errors", "compiled", "writing"},
-    {"responses", "runs", "sampler_cpu"},
-    {"acquisition", "sampler"},
-    {"belief", "features", "gridworld"},
-    {"queries", "humans", "objectives"},
-    {"envs"},
+    {"errors", "compiled", "per_belief", "writing"},
+    {"checks", "files", "memory", "runs", "sampler_cpu", "scoring_cpu", "tensors"},
+    {"responses", "resampling_cpu"},
+    {"acquisition", "resampling", "settings"},
+    {"sampler", "features"},
+    {"belief", "gridworld"},
+    {"queries", "humans", "objectives", "sessions"},
+    {"contents", "envs", "restore"},
     {"strategies"},
     {"scorer", "attention"},
     {"policies"},
-    {"checkpoint", "evaluation", "training"},
+    {"collection", "evaluation"},
+    {"progress"},
+    {"checkpoint", "training"},
     {"experiment"},
     {"comparison", "pretrained"},
-    {"heldout", "reports"},
-    {"heldout_report", "sweeps"},
+    {"heldout", "learning_curve", "reports"},
+    {"heldout_report", "sweeps", "training_report"},
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 

@@ -3,19 +3,12 @@ import math
 import pytest
 import torch
 from conftest import RESPONSE_MODELS
+from posterior import posterior
 from torch import Generator, Tensor
 
-from torchrl_pref.belief import (
-    Belief,
-    feature_gaps,
-    kish_share,
-    orthonormal,
-    systematic_resample,
-    uniform_sphere,
-)
+from benchmarks.posterior import Case, compare, history
+from torchrl_pref.belief import Belief, feature_gaps, uniform_sphere
 from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel
-from torchrl_pref.sampler import ARC, MAX_SHRINKS, compiled_constants, tensor_step
-from torchrl_pref.sampler_cpu import compiled_step
 
 
 class Unknown(ResponseModel):
@@ -91,36 +84,42 @@ def test_moments_agree_with_quadrature(
 
 
 @pytest.mark.parametrize("model", RESPONSE_MODELS, ids=str)
-def test_effective_sample_size_is_what_it_says(model: ResponseModel, generator: Generator) -> None:
+def test_effective_sample_size_is_what_it_says(
+    model: ResponseModel, generator: Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Var(ω) / ESS is the variance of the mean over independent runs of the same answers."""
+    monkeypatch.setattr("torchrl_pref.belief.MAX_ROUNDS", 1)
     queries = torch.randn(3, 2, 4, generator=generator)
     omega = uniform_sphere((4,), generator)
     answers = (queries @ omega).argmax(-1)
     samples, ess = converse(Belief(model, moves=1), queries, answers, 400, generator)
     true = samples.flatten(0, 1).var(0).sum() / samples.mean(1).var(0).sum()
     assert float(true) < 70  # one move leaves copies close together: there is something to report
-    assert float(ess.mean()) == pytest.approx(float(true), rel=0.25)
+    assert float(ess.mean()) == pytest.approx(float(true), rel=0.15)
     assert ((ess >= 1) & (ess <= 100)).all()
 
 
+@pytest.mark.parametrize(("n_features", "n_options"), [(4, 2), (5, 3), (10, 3)])
 @pytest.mark.parametrize("model", RESPONSE_MODELS, ids=str)
-def test_calibration(model: ResponseModel, generator: Generator) -> None:
+def test_calibration(
+    model: ResponseModel, n_features: int, n_options: int, generator: Generator
+) -> None:
     """Simulation-based calibration (Talts et al., 2018): the rank of the truth is uniform."""
-    sessions, budget, n_features = 2000, 8, 4
-    belief = Belief(model, samples=99, moves=8)
+    sessions, budget = 2000, 8
+    belief = Belief(model, samples=99)
     omega = uniform_sphere((sessions, n_features), generator)
     samples = belief.prior(sessions, n_features, generator)
     ess = torch.full((sessions,), 99.0)
-    gaps = torch.zeros(sessions, 0, 1, n_features)
+    gaps = torch.zeros(sessions, 0, n_options - 1, n_features)
     for _ in range(budget):
-        queries = torch.randn(sessions, 2, n_features, generator=generator)
+        queries = torch.randn(sessions, n_options, n_features, generator=generator)
         log_probs = model((queries @ omega.unsqueeze(-1)).squeeze(-1))
         answers = log_probs.exp().multinomial(1, generator=generator).squeeze(-1)
         newest = feature_gaps(queries, answers)
         samples, ess, _ = belief.update(samples, ess, gaps, newest, generator)
         gaps = torch.cat([gaps, newest.unsqueeze(1)], 1)
         # Hard answers never exclude the human who gave them.
-        returns = (gaps @ omega[:, None, :, None]).squeeze(-1)
+        returns = (gaps.flatten(1, 2) @ omega.unsqueeze(-1)).view(gaps.shape[:3])
         assert model.log_likelihood(returns).sum(-1).isfinite().all()
     assert samples.isfinite().all()
     for feature in range(n_features):
@@ -130,6 +129,49 @@ def test_calibration(model: ResponseModel, generator: Generator) -> None:
         # 9 degrees of freedom: 33.7 is exceeded once in 10,000. The samples of a session are not
         # independent, which widens it a little.
         assert chi_square < 33.7
+
+
+CASES = [
+    Case(2, 3, 4.5, "contradictory"),
+    Case(2, 2, None, "60 answers"),
+    Case(4, 5, 4.5, "surprising"),
+    Case(4, 5, 30.0, "surprising"),
+    Case(4, 2, 30.0, "gaps of 1e3"),
+    Case(4, 3, 4.5, "gaps of 1e-4"),
+    Case(6, 3, 4.5, "collinear"),
+    Case(8, 2, 4.5, "greedy"),
+    Case(8, 3, None, "random"),
+    Case(16, 2, 4.5, "greedy"),
+]
+
+
+@pytest.mark.parametrize("case", CASES, ids=str)
+def test_samples_agree_with_importance_sampling(case: Case) -> None:
+    """Over features, options, noise and odd histories; the benchmark has all of them."""
+    gaps = history(case)
+    exact = posterior(gaps.double().numpy(), case.tau)
+    found = compare(case, gaps, exact, 1000 if case.kind == "greedy" else 200)
+    assert exact.draws > 5000
+    assert found.bias < 0.01 + 3 * found.bias_error
+    assert abs(found.variance - 1) < 0.01 + 3 * found.variance_error
+    assert found.effective > 60
+
+
+def test_one_question_answered_both_ways_without_error_is_left_out(generator: Generator) -> None:
+    """It could hold on a plane of ties alone."""
+    belief, sessions = Belief(Optimal()), 200
+    queries = torch.randn(sessions, 3, 5, generator=generator)
+    samples, ess = belief.prior(sessions, 5, generator), torch.full((sessions,), 100.0)
+    gaps = torch.zeros(sessions, 0, 2, 5)
+    for answer, used in ((0, True), (1, False), (0, True), (2, False)):
+        newest = feature_gaps(queries, torch.full((sessions,), answer))
+        after = belief.update(samples, ess, gaps, newest, generator)
+        assert (after.used == used).all()
+        if used:
+            gaps = torch.cat([gaps, newest.unsqueeze(1)], 1)
+        else:
+            assert torch.equal(after.samples, samples)
+        samples, ess = after.samples, after.ess
 
 
 def test_contradicting_hard_answer_is_left_out(generator: Generator) -> None:
@@ -202,52 +244,6 @@ def test_identical_options_teach_nothing(belief: Belief, generator: Generator) -
     assert (ess > 90).all()
 
 
-@pytest.mark.parametrize("spread", [0.2, 0.02])
-@pytest.mark.parametrize(("n_options", "n_features"), [(2, 4), (4, 4), (2, 2)])
-@pytest.mark.parametrize("model", [*RESPONSE_MODELS, Boltzmann(300.0)], ids=str)
-def test_compiled_step_moves_samples_where_the_tensor_step_does(
-    model: ResponseModel, n_options: int, n_features: int, spread: float, generator: Generator
-) -> None:
-    sessions = 20
-    belief = Belief(model)
-    samples, ess = belief.prior(sessions, n_features, generator), torch.full((sessions,), 100.0)
-    omega = uniform_sphere((sessions, n_features, 1), generator)
-    gaps = torch.zeros(sessions, 9, n_options - 1, n_features)
-    for h in range(9):
-        queries = torch.randn(sessions, n_options, n_features, generator=generator)
-        answers = model((queries @ omega).squeeze(-1)).exp().multinomial(1, generator=generator)
-        newest = feature_gaps(queries, answers.squeeze(-1))
-        samples, ess, _ = belief.update(samples, ess, gaps, newest, generator)
-        gaps[:, h] = newest  # until then a row of zeros
-    poles = torch.randn(samples.shape, generator=generator) * spread
-    uniform = torch.rand((*samples.shape[:2], 2 + MAX_SHRINKS), generator=generator)
-    for slack in (torch.zeros(sessions), torch.rand(sessions, generator=generator)):
-        given = samples, poles, gaps, slack, uniform
-        constants = compiled_constants(model)
-        assert constants is not None
-        compiled = compiled_step(*given, ARC, *constants)
-        close = (compiled - tensor_step(*given, model)).norm(dim=-1) < 1e-3
-        # A proposal at the very edge of its slice may be judged differently.
-        assert close.float().mean() > 0.995
-        assert ((compiled - samples).norm(dim=-1) > 1e-3).float().mean() > 0.9
-
-
-@pytest.mark.parametrize("model", RESPONSE_MODELS, ids=str)
-def test_tensor_step_stays_on_its_device(model: ResponseModel) -> None:
-    """``meta`` stands for a GPU: nothing is computed, but devices must not be mixed."""
-    shapes = (5, 30, 4), (5, 30, 4), (5, 7, 1, 4), (5,), (5, 30, 2 + MAX_SHRINKS)
-    moved = tensor_step(*(torch.empty(shape, device="meta") for shape in shapes), model)
-    assert moved.device.type == "meta"
-    assert moved.shape == shapes[0]
-
-
-@pytest.mark.parametrize("n", [3, 4, 7])
-def test_directions_come_in_orthonormal_frames(n: int, generator: Generator) -> None:
-    vectors = orthonormal(n, torch.Size((5, 6, 3)), generator).movedim(0, -2)
-    for frame in vectors.split(3, -2):
-        assert torch.allclose(frame @ frame.mT, torch.eye(frame.shape[-2]), atol=1e-3)
-
-
 def test_permuting_options_permutes_the_answer(generator: Generator) -> None:
     queries = torch.randn(20, 4, 3, generator=generator)
     answers = torch.randint(4, (20,), generator=generator)
@@ -258,20 +254,12 @@ def test_permuting_options_permutes_the_answer(generator: Generator) -> None:
     assert (feature_gaps(queries, torch.full((20,), -1)) == 0).all()
 
 
-def test_resampling_follows_the_weights(generator: Generator) -> None:
-    log_weights = torch.tensor([[0.0, math.log(2), -math.inf, 0.0]]).expand(2000, 4)
-    counts = systematic_resample(log_weights, generator).flatten().bincount(minlength=4) / 2000
-    assert counts.tolist() == pytest.approx([1, 2, 0, 1], abs=0.05)
-    assert float(kish_share(log_weights[0])) == pytest.approx(16 / (4 * 6))
-    assert float(kish_share(torch.full((4,), -math.inf))) == 0
-
-
 @pytest.mark.parametrize("model", RESPONSE_MODELS, ids=str)
 def test_large_batches_lose_no_answer(
     model: ResponseModel, generator: Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Sessions are moved some at a time, with answers of their own number."""
-    monkeypatch.setattr("torchrl_pref.belief.MOVED", 40 * 10)
+    monkeypatch.setattr("torchrl_pref.belief.MOVED", 40 * 4 * 10)
     sessions = 37
     belief = Belief(model, samples=40)
     normals = torch.eye(3)

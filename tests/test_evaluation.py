@@ -1,3 +1,6 @@
+import math
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import scipy.stats
@@ -7,10 +10,17 @@ from test_envs import make
 from test_training import settings_of, trainer_of
 from torch import Generator
 
-from torchrl_pref.comparison import check_evaluation
+from torchrl_pref.acquisition import alignment_gain
+from torchrl_pref.comparison import (
+    check_evaluation,
+    compare,
+    evaluate_panels,
+    group_checkpoints,
+)
 from torchrl_pref.envs import FeedEnv, QueryEnv
 from torchrl_pref.evaluation import CURVES, bootstrap_interval, draw_humans, evaluate
-from torchrl_pref.experiment import make_query_env
+from torchrl_pref.experiment import make_checkpoint, make_query_env
+from torchrl_pref.policies import paper_policy
 from torchrl_pref.queries import QueryPool
 from torchrl_pref.strategies import Greedy, RandomAsk, RandomQuery
 
@@ -52,6 +62,15 @@ def test_feed_curves_count_answers_and_not_offers(pool: QueryPool) -> None:
     assert torch.equal(nothing.alignment[:, 0], nothing.alignment[:, -1])
 
 
+def test_repeats_are_asked_queries_and_not_open_slots(pool: QueryPool) -> None:
+    single = QueryPool(pool.features[:1])
+    env = make(FeedEnv, single, batch=40, offers=7)
+    result = evaluate(env, RandomAsk(0.4, seed=1), draw_humans(env))
+    assert result.asked.min() == 0
+    assert result.asked.max() > 2
+    assert torch.equal(result.repeated, (result.asked - 1).clamp(min=0))
+
+
 def test_strategies_face_the_same_humans_and_luck(pool: QueryPool) -> None:
     """With one query in the pool every strategy asks the same, and must hear the same."""
     single = QueryPool(pool.features[:1])
@@ -71,6 +90,80 @@ def test_strategies_face_the_same_humans_and_luck(pool: QueryPool) -> None:
     assert 0 < float(answers[0].float().mean()) < 1
 
 
+def test_a_policy_draws_its_actions_only_where_it_is_told_to(pool: QueryPool) -> None:
+    env = make(FeedEnv, pool, batch=200, offers=20)
+    policy = paper_policy(env)
+    with torch.no_grad():
+        for weight in policy.weights.parameters():
+            weight.zero_()
+        list(policy.actor.parameters())[-1][1] = 1.0  # asks with probability e / (1 + e)
+    humans = draw_humans(env)
+    assert (evaluate(env, policy.strategy, humans).offered == 5).all()
+    drawn = evaluate(env, policy.strategy, humans, sample=True)
+    assert (drawn.asked == 5).all()
+    # Offers until the fifth ask: a negative binomial.
+    assert float(drawn.offered.float().mean()) == pytest.approx(5 * (1 + 1 / math.e), abs=0.5)
+
+
+def test_time_is_told_for_each_asked_query(
+    pool: QueryPool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env = make(FeedEnv, pool, batch=8, offers=7)
+    humans = draw_humans(env)
+    clock = SimpleNamespace(perf_counter=iter([10.0, 12.0]).__next__)
+    monkeypatch.setattr("torchrl_pref.evaluation.time", clock)
+    result = evaluate(env, RandomAsk(0.4, seed=1), humans)
+    assert result.seconds_per_query == pytest.approx(2.0 / int(result.asked.sum()))
+
+
+@pytest.mark.parametrize("setup", ["query", "feed"])
+def test_compared_strategies_have_the_luck_that_they_have_alone(setup: str) -> None:
+    """Nothing depends on what ran before: neither the belief's luck nor a policy's own dice."""
+    settings = settings_of(setup)
+    settings["policy"]["sample"] = True
+    trainer, task = trainer_of(settings)
+    checkpoint = make_checkpoint(settings, task, trainer)
+    results = compare(settings, task, task.test, {"one": checkpoint, "other": checkpoint})
+    n_humans, seed = check_evaluation(settings)
+    env = make_query_env(settings, task, task.test, n_humans, seed)
+    humans = draw_humans(env)
+    for name, strategy in (
+        ("greedy", Greedy(task.response_model)),
+        ("greedy alignment", Greedy(task.response_model, alignment_gain)),
+    ):
+        env.set_seed(seed)
+        alone = evaluate(env, strategy, humans)
+        for curve in CURVES:
+            assert torch.equal(getattr(results[name], curve), getattr(alone, curve)), (name, curve)
+    for curve in CURVES:
+        assert torch.equal(getattr(results["one"], curve), getattr(results["other"], curve))
+    assert len({float(result.alignment[:, 0].sum()) for result in results.values()}) == 1
+
+
+def test_a_policy_that_picks_indices_is_shown_on_its_own_pool_too() -> None:
+    settings = settings_of("query", "paper")
+    trainer, task = trainer_of(settings)
+    learned = {"RL": make_checkpoint(settings, task, trainer)}
+    held_out, own = evaluate_panels(settings, task, learned).items()
+    assert held_out[0].endswith("held-out pool")
+    assert own[0].endswith("training pool")
+    for (_, results), pool in ((held_out, task.test), (own, task.train)):
+        for name, result in compare(settings, task, pool, learned).items():
+            assert torch.equal(results[name].alignment, result.alignment)
+    assert not torch.equal(held_out[1]["RL"].alignment, own[1]["RL"].alignment)
+
+
+def test_runs_of_one_kind_are_told_apart_by_their_names() -> None:
+    runs = []
+    for name, setup in (("a", "query"), ("b", "query"), ("c", "feed")):
+        settings = settings_of(setup)
+        trainer, task = trainer_of(settings)
+        runs.append((name, make_checkpoint(settings, task, trainer), task))
+    ((settings, _, learned),) = group_checkpoints(runs)
+    assert list(learned) == ["RL (a)", "RL (b)", "RL-feed"]
+    assert settings["setup"]["name"] == "feed"  # the baselines of a feed are shown too
+
+
 def test_bootstrap_agrees_with_scipy(generator: Generator) -> None:
     values = torch.randn(60, generator=generator) ** 2
     expected = scipy.stats.bootstrap(
@@ -86,5 +179,5 @@ def test_humans_of_the_evaluation_are_not_those_of_the_training() -> None:
     trainer, task = trainer_of(settings)
     n_humans, seed = check_evaluation(settings)
     judged = draw_humans(make_query_env(settings, task, task.test, n_humans, seed))
-    trained = trainer.collector._carrier
+    trained = trainer.sessions.now
     assert not torch.isclose(judged["human", "omega"], trained["human", "omega"]).any()

@@ -24,7 +24,7 @@ from torchrl_pref.heldout import (
     two_way_interval,
 )
 from torchrl_pref.heldout_report import paired, reaches, write_heldout
-from torchrl_pref.queries import gridworld_pool
+from torchrl_pref.queries import QueryPool, gridworld_pool
 from torchrl_pref.strategies import RandomAsk
 
 
@@ -51,6 +51,14 @@ def test_interval_covers_pools_and_seeds(generator: Generator) -> None:
     assert 0.85 < covered / 400 < 0.97
     assert widths == pytest.approx(2 * 1.96 * (1 / 10 + 0.25 / 5) ** 0.5, rel=0.15)
     assert two_way_interval(torch.full((3, 2), 0.7)) == (pytest.approx(0.7), pytest.approx(0.7))
+
+
+def test_interval_is_widened_by_what_few_pools_hide() -> None:
+    """Two pools at 0 and 1: a bootstrap's mean is 0, 1/2 or 1, and its interval all of it. Of the
+    variance between two pools it shows half."""
+    low, high = two_way_interval(torch.tensor([[0.0], [1.0]]))
+    assert low == pytest.approx(0.5 - 0.5 * 2**0.5)
+    assert high == pytest.approx(0.5 + 0.5 * 2**0.5)
 
 
 def test_differences_are_paired_and_levels_are_reached() -> None:
@@ -94,11 +102,18 @@ def test_protocol_pairs_all_strategies_on_pools_of_its_own(
         if setup == "feed":  # one name alone takes every offer
             assert (row[once][0].offered == row[once][0].asked).all()
             assert (row[rival][0].offered > row[rival][0].asked).any()
+        if setup == "query":
+            assert (row["greedy information, no repeats"][0].repeated == 0).all()
+            (fine,) = row["greedy information, M=40 (2 humans a pool)"]
+            assert fine.ess[:, 0].tolist() == [40.0, 40.0]
         # All start from the same prior samples of the same humans.
         start = row["RL"][0].alignment[:, 0]
         for name, results in row.items():
             if "M=40" not in name:
                 assert torch.equal(results[0].alignment[:, 0], start)
+    # Another pool, other humans.
+    first, second = (row["RL"][0].alignment[:, 0] for row in rows)
+    assert not torch.isclose(first, second).any()
     trained = make_pools(settings)
     for pool in (0, 1):
         _, own = heldout._task_and_pool(Job(settings, cell, pool))
@@ -107,6 +122,32 @@ def test_protocol_pairs_all_strategies_on_pools_of_its_own(
     write_heldout(tmp_path, {cell: heldout._gather(rows)})
     assert (tmp_path / "heldout.png").stat().st_size > 10_000
     assert "RL minus it" in (tmp_path / "heldout.txt").read_text()
+
+
+def test_no_two_pools_share_a_seed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pool takes its seed for the starts and the next one for the moves."""
+    seeds: list[int] = []
+
+    def watched(n_queries: int, n_options: int, size: int, length: int, seed: int) -> QueryPool:
+        seeds.extend((seed, seed + 1))
+        return gridworld_pool(n_queries, n_options, size, length, seed)
+
+    monkeypatch.setattr(heldout, "gridworld_pool", watched)
+    monkeypatch.setattr("torchrl_pref.experiment.gridworld_pool", watched)
+    for pool in range(heldout.POOLS):
+        heldout._task_and_pool(Job(settings_of("feed"), Cell("feed", "noisy"), pool))
+    per_call = 2 * 3  # training, test, and the pool itself
+    assert len(seeds) == per_call * heldout.POOLS
+    assert len(set(seeds)) == 4 + 2 * heldout.POOLS
+
+
+def test_the_threshold_is_fitted_without_a_look_at_the_test_pools() -> None:
+    fits = []
+    for pool in (0, 1):
+        job = Job(settings_of("feed"), Cell("feed", "noisy"), pool, thresholds=(0.1, 0.4))
+        fits.append(heldout._fit_threshold(job))
+    assert torch.equal(*fits)
+    assert fits[0][0] != fits[0][1]
 
 
 def test_policies_of_other_tasks_are_refused() -> None:
@@ -126,6 +167,19 @@ def test_normaliser_is_that_of_the_training_pool() -> None:
     task, own = heldout._task_and_pool(Job(settings, Cell("query", "noisy"), 3))
     assert torch.equal(task.normalizer.mean, Normalizer.fit(train.features).mean)
     assert own.features.mean().abs() > 1e-6
+
+
+def test_features_are_balanced_by_the_training_pool() -> None:
+    task, own = heldout._task_and_pool(
+        Job(settings_of("query"), Cell("query", "noisy", "balanced"), 0)
+    )
+    largest = []
+    for pool in (task.train, own):
+        gaps = pool.features[:, 0] - pool.features[:, 1]
+        covariance = gaps.mT @ gaps / len(gaps)
+        largest.append(float((covariance - covariance.diagonal().diag()).abs().amax()))
+    assert largest[0] < 1e-3
+    assert largest[1] > 0.05
 
 
 def test_strategies_side_by_side_meet_the_same_offers_and_humans() -> None:

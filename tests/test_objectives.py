@@ -7,6 +7,7 @@ from conftest import RESPONSE_MODELS
 from reference import answer_probs
 from test_envs import coin, make
 from test_policies import session_of
+from torch import Generator
 
 from torchrl_pref.belief import Belief
 from torchrl_pref.envs import FeedEnv, QueryEnv
@@ -103,6 +104,24 @@ def test_skips_are_free_and_offers_run_out(pool: QueryPool) -> None:
     assert not session["truncated"].any()
 
 
+@pytest.mark.parametrize("on_skip", ["new", "repeat"])
+def test_running_out_of_free_offers_is_an_end_and_no_interruption(
+    on_skip: str, pool: QueryPool
+) -> None:
+    """An interruption would tell the critic to add what might have come after the last offer."""
+    env = make(FeedEnv, pool, batch=60, offers=9, skip="free", on_skip=on_skip)
+    data = env.rollout(9, coin(env, 1), break_when_any_done=False)
+    assert data.shape == (60, 9)
+    ended = data["next", "done"].squeeze(-1)
+    out_of_offers = (data["next", "n_offered"] == 9).squeeze(-1)
+    full = (data["next", "n_asked"] == 5).squeeze(-1)
+    assert torch.equal(ended, out_of_offers | full)
+    assert (out_of_offers & ~full).any()
+    assert (full & ~out_of_offers).any()
+    assert torch.equal(data["next", "terminated"], data["next", "done"])
+    assert not data["next", "truncated"].any()
+
+
 def test_entropy_falls_by_a_bit_for_a_halved_interval() -> None:
     """On the circle: D - 1 = 1 direction. A belief half as wide has lost one bit."""
     potentials = []
@@ -111,6 +130,17 @@ def test_entropy_falls_by_a_bit_for_a_halved_interval() -> None:
         samples = torch.stack([angles.cos(), angles.sin()], -1).unsqueeze(0)
         potentials.append(make_objective("entropy").potential({"samples": samples}))  # type: ignore[arg-type]
     assert float(potentials[1] - potentials[0]) == pytest.approx(1, abs=0.02)
+
+
+def test_entropy_is_told_by_the_distance_to_the_third_nearest(generator: Generator) -> None:
+    samples = torch.randn(2, 30, 4, generator=generator)
+    expected = []
+    for each in samples.double().numpy():
+        distances = np.linalg.norm(each[:, None] - each, axis=-1)
+        third = np.sort(distances, axis=1)[:, 3]  # the nearest of all is the sample itself
+        expected.append(-3 * np.log2(third).mean())
+    potential = make_objective("entropy").potential({"samples": samples})  # type: ignore[arg-type]
+    assert potential.squeeze(-1).tolist() == pytest.approx(expected, abs=1e-4)
 
 
 def test_unknown_objective_is_refused() -> None:

@@ -1,3 +1,5 @@
+import math
+
 import pytest
 import torch
 from conftest import RESPONSE_MODELS
@@ -7,14 +9,25 @@ from torch import Generator
 from torch.nn import functional as F
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_pref.acquisition import alignment_gain, information_gain
+from torchrl_pref.acquisition import (
+    alignment_gain,
+    information_gain,
+    predict_answers,
+    volume_removal,
+)
 from torchrl_pref.attention import TOKENS, belief_tokens
-from torchrl_pref.belief import covariance_of
 from torchrl_pref.envs import FeedEnv, QueryEnv
 from torchrl_pref.objectives import make_objective
 from torchrl_pref.policies import Policy, attention_policy, paper_policy, scorer_policy
 from torchrl_pref.queries import QueryPool
+from torchrl_pref.resampling import covariance_of
 from torchrl_pref.responses import ResponseModel
+from torchrl_pref.scorer import (
+    FEED_SCALE,
+    PATIENCE_SCALE,
+    CandidateFeatures,
+    OfferScorer,
+)
 from torchrl_pref.strategies import QuantileAsk, RandomAsk, RandomQuery
 
 
@@ -108,6 +121,57 @@ def test_patience_asks_early_and_waits_late(pool: QueryPool) -> None:
     assert torch.allclose(late, rule, atol=1e-5)
 
 
+def test_patience_grows_the_share_by_how_late_the_asks_left_are(pool: QueryPool) -> None:
+    """With asks 3, 4 and 5 left of five, the next is number 3 and the mean number is 4."""
+    env = make(FeedEnv, pool, batch=30, offers=40, skip="free")
+    session = session_of(env)
+    session["n_offered"].fill_(1)
+    for asked in range(5):
+        session["n_asked"].fill_(asked)
+        rule = with_patience(scorer_policy(env), 0.0, 0.0).strategy(session.clone())["logits"]
+        # A patience of one per unit of urgency multiplies the share by the quotient itself.
+        policy = with_patience(scorer_policy(env), 1 / PATIENCE_SCALE, 0.0)
+        logits = policy.strategy(session.clone())["logits"]
+        to_come = range(asked + 1, 6)
+        quotient = sum(to_come) / len(to_come) / to_come[0]
+        share = len(to_come) / 39
+        expected = FEED_SCALE * share * (quotient - 1)
+        assert share * quotient < 1
+        assert torch.allclose(logits[:, 1] - rule[:, 1], torch.tensor(expected), atol=1e-3)
+
+
+def test_patience_shrinks_the_share_by_the_misalignment_that_is_left(pool: QueryPool) -> None:
+    env = make(FeedEnv, pool, batch=30, offers=100, skip="free")
+    session = session_of(env)
+    rule = with_patience(scorer_policy(env), 0.0, 0.0).strategy(session.clone())["logits"]
+    # A patience of one per unit of urgency multiplies the share by e times the misalignment.
+    policy = with_patience(scorer_policy(env), 0.0, 1 / PATIENCE_SCALE)
+    logits = policy.strategy(session.clone())["logits"]
+    left = 1 - session["samples"].mean(1).square().sum(-1)
+    assert left.amin() < 0.8
+    share = (env.budget - session["n_asked"]) / (env.n_offers - session["n_offered"])
+    expected = FEED_SCALE * share.squeeze(-1) * (math.e * left - 1)
+    assert torch.allclose(logits[:, 1] - rule[:, 1], expected, atol=1e-3)
+
+
+@pytest.mark.parametrize("left", [1, 2, 5])
+def test_the_last_offers_are_asked_whatever_was_learned(left: int, pool: QueryPool) -> None:
+    """With as many offers left as asks, each must be asked; with one offer more, none must."""
+    env = make(FeedEnv, pool, batch=10, offers=12, skip="free")
+    policy = scorer_policy(env)
+    with torch.no_grad():  # the correction of the logits: skip, by far
+        next(m for m in policy.actor.modules() if isinstance(m, OfferScorer)).network[-1].bias -= 20
+    session = session_of(env)
+    # Of two options that are alike nothing can be learned: no query of the pool is poorer.
+    session["offer"] = pool.features[0, 0].expand_as(session["offer"]).clone()
+    session["n_asked"].fill_(5 - left)
+    for more, asks in ((0, 1), (1, 0)):
+        session["n_offered"].fill_(12 - left - more)
+        logits = policy.strategy(session.clone())["logits"]
+        assert (logits.argmax(-1) == asks).all()
+        assert (logits.softmax(-1)[:, asks] > 0.99).all()
+
+
 def test_patience_waits_when_the_belief_is_sure(pool: QueryPool) -> None:
     env = make(FeedEnv, pool, batch=200, skip="free")
     policy, session = scorer_policy(env), session_of(env)
@@ -119,6 +183,49 @@ def test_patience_waits_when_the_belief_is_sure(pool: QueryPool) -> None:
     after = [policy.strategy(each.clone())["logits"][:, 1] for each in (session, sure)]
     assert (after[0] > rule[0]).all()
     assert (after[1] < rule[1]).all()
+
+
+@pytest.mark.parametrize("options", [2, 3])
+def test_candidates_are_described_by_what_the_belief_knows(
+    options: int, generator: Generator
+) -> None:
+    """Option by option: how far its return lies from the mean return of its query."""
+    env = make(QueryEnv, QueryPool(torch.randn(9, options, 4, generator=generator)))
+    session, model = session_of(env), env.belief.response_model
+    found = CandidateFeatures(model)(session["samples"], session["queries"])
+    for b, c in ((0, 0), (1, 4), (3, 8)):
+        samples, features = session["samples"][b], session["queries"][b, c]
+        predicted = predict_answers(samples[None], features[None, None], model)
+        scores = [
+            float(function(predicted, samples[None]))
+            for function in (information_gain, alignment_gain, volume_removal)
+        ]
+        returns = samples @ features.T  # (M K)
+        apart = returns - returns.mean(1, keepdim=True)
+        variance = float(apart.var(0, correction=0).sum())
+        scores += [variance**0.5, variance, float(apart.mean(0).norm())]
+        scores.append(float((features - features.mean(0)).norm()))
+        assert found[b, c].tolist() == pytest.approx(scores, abs=1e-4)
+
+
+@pytest.mark.parametrize("n_features", [2, 3, 5])
+def test_belief_is_summed_up_by_its_length_and_its_widths(
+    n_features: int, generator: Generator
+) -> None:
+    """Samples around a given mean whose variances along turned axes are given."""
+    variances = torch.tensor([0.5, 0.03, 0.002, 0.1, 0.009])[:n_features]
+    cross = torch.cat([torch.eye(n_features), -torch.eye(n_features)])  # (2D D), variance 1/D
+    turn = torch.linalg.qr(torch.randn(n_features, n_features, generator=generator)).Q
+    mean = torch.linspace(0.1, 0.4, n_features)
+    samples = mean + (cross * (n_features * variances).sqrt()) @ turn
+    env = make(QueryEnv, QueryPool(torch.randn(9, 2, n_features, generator=generator)))
+    session = session_of(env)
+    session["samples"] = samples.repeat(4, 1, 1)
+    session["remaining"] = torch.full((4, 1), 0.3)
+    found = scorer_policy(env).strategy(session)["belief_features"][2]
+    widths = torch.stack([variances.max(), variances.mean(), variances.min()]).log() / 4
+    expected = torch.cat([torch.tensor([0.3]), mean.norm().unsqueeze(0), widths])
+    assert torch.allclose(found, expected, atol=1e-4)
 
 
 @pytest.mark.parametrize("kind", ENVS)

@@ -11,7 +11,7 @@ from torchrl.envs.utils import check_env_specs
 from torchrl_pref.errors import InputError
 from torchrl_pref.features import Normalizer, corner_distances
 from torchrl_pref.gridworld import MOVES, Gridworld, random_walks
-from torchrl_pref.queries import QueryPool, gridworld_pool
+from torchrl_pref.queries import QueryPool, gridworld_pool, save_atomically
 
 
 def test_gridworld_moves_and_walls() -> None:
@@ -109,6 +109,46 @@ def test_pool_survives_a_file_and_knows_itself(tmp_path: Path) -> None:
     assert gridworld_pool(20, 3, seed=1).digest != pool.digest
     assert pool.map_features(lambda features: features.flip(0)).digest != pool.digest
     assert sorted(os.listdir(tmp_path)) == ["pool.pt"]
+
+
+def test_the_gridworld_pool_is_what_it_has_always_been() -> None:
+    """Made by version 0.1.0: what was measured on a pool of a seed holds for that very pool."""
+    digests = [
+        gridworld_pool(5).digest,
+        gridworld_pool(5, 3, size=5, length=7, seed=3).digest,
+    ]
+    assert digests == [
+        "b3f436907695d7f2482c54548faa42d02f2ddd000a59a53571ca4114ff636c54",
+        "292e1548256e4688984eb07bbf0e6c4316cb96e38083397ecebcf12a8cc6a50c",
+    ]
+
+
+def test_a_reader_never_sees_half_a_file(tmp_path: Path) -> None:
+    """Who has opened the old file goes on reading the old one, whole, while a new one is put in its
+    place."""
+    path = tmp_path / "pool.pt"
+    gridworld_pool(20).save(path)
+    old = path.read_bytes()
+    with path.open("rb") as reader:
+        start = reader.read(100)
+        gridworld_pool(30, seed=1).save(path)
+        assert start + reader.read() == old
+    assert QueryPool.load(path).digest == gridworld_pool(30, seed=1).digest
+
+
+class _DiskIsFull:
+    def __reduce__(self) -> tuple[object, ...]:
+        raise OSError("No space left on device")
+
+
+def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "pool.pt"
+    gridworld_pool(20).save(path)
+    old = path.read_bytes()
+    with pytest.raises(InputError, match="cannot be written"):
+        save_atomically({"features": torch.rand(9), "then": _DiskIsFull()}, path)
+    assert path.read_bytes() == old
+    assert os.listdir(tmp_path) == ["pool.pt"]
 
 
 def test_bad_pool_files_are_refused(tmp_path: Path) -> None:

@@ -4,21 +4,21 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
+import torch
 from conftest import RESPONSE_MODELS
 from test_envs import make
 
 from torchrl_pref.envs import QueryEnv
-from torchrl_pref.evaluation import draw_humans, evaluate
+from torchrl_pref.evaluation import Evaluation, draw_humans, evaluate
 from torchrl_pref.queries import QueryPool
 from torchrl_pref.reports import (
     alignment_table,
-    even_edges,
-    geometric_edges,
+    few_samples,
     milestones,
-    smoothed,
     write_curves,
 )
 from torchrl_pref.strategies import Greedy, RandomQuery
+from torchrl_pref.training_report import even_edges, geometric_edges, smoothed
 
 
 @pytest.mark.parametrize("edges_of", [even_edges, geometric_edges])
@@ -65,3 +65,17 @@ def test_tables_and_curves_say_what_was_measured(pool: QueryPool, tmp_path: Path
         if (row["strategy"], row["queries"], row["metric"]) == ("random", "3", "alignment")
     ]
     assert float(row["mean"]) == pytest.approx(float(random[:, 3].mean()), abs=1e-5)
+
+
+def test_a_belief_worth_few_samples_is_told() -> None:
+    def ess(*least: float) -> Evaluation:
+        values = torch.full((3, 5), 100.0)
+        values[0, 2 : 2 + len(least)] = torch.tensor(least)
+        nothing = torch.zeros(3)
+        return Evaluation(values, values, values, values, *[nothing] * 3, 0.0)
+
+    assert few_samples({"greedy": ess(51.0), "random": ess()}) == []
+    line, blank = few_samples({"greedy": ess(60.0, 21.0), "random": ess()})
+    assert line.startswith("! greedy information gain: in 1 of 3 sessions")
+    assert "least: 21 of 100" in line
+    assert blank == ""

@@ -19,6 +19,7 @@ from torchrl_pref.objectives import make_objective
 from torchrl_pref.queries import QueryPool
 from torchrl_pref.responses import Prediction, ResponseModel
 from torchrl_pref.strategies import (
+    REFERENCE,
     Greedy,
     Lookahead,
     OfferRank,
@@ -103,6 +104,22 @@ def test_threshold_asks_above_it_and_at_the_end(pool: QueryPool) -> None:
         assert torch.equal(data["action"][:, step] == 1, asks)
 
 
+@pytest.mark.parametrize("left", [1, 2, 5])
+def test_the_last_offers_are_asked_however_poor(left: int, pool: QueryPool) -> None:
+    """With as many offers left as asks, each must be asked; with one offer more, none must."""
+    env = make(FeedEnv, pool, batch=10, offers=12, skip="free")
+    session = session_of(env)
+    # Of two options that are alike nothing can be learned: no query of the pool is poorer.
+    session["offer"] = pool.features[0, 0].expand_as(session["offer"]).clone()
+    session["n_asked"].fill_(5 - left)
+    rules = [ThresholdAsk(env, 0.5), QuantileAsk(env), QuantileAsk(env, alignment_gain)]
+    rules.append(QuantileAsk(env, information_gain, late=alignment_gain))
+    for more, asks in ((0, 1), (1, 0)):
+        session["n_offered"].fill_(12 - left - more)
+        for rule in rules:
+            assert (rule(session.clone())["action"] == asks).all()
+
+
 @pytest.mark.parametrize("left", [1.0, 0.25])
 def test_rank_by_two_functions_weighs_them_by_the_asks_left(left: float, pool: QueryPool) -> None:
     env = make(FeedEnv, pool, batch=40, skip="free")
@@ -124,6 +141,17 @@ def test_rank_by_two_functions_weighs_them_by_the_asks_left(left: float, pool: Q
     own = [rank_of(first["samples"], query.expand(40, -1, -1), share) for query in pool.features]
     highest = (len(pool) - 0.5) / len(pool)
     assert torch.stack(own).amax().item() == pytest.approx(highest, abs=1e-6)
+
+
+def test_rank_is_that_among_the_whole_pool(generator: Generator) -> None:
+    """Of a pool larger than the sample, whose first half teaches nothing."""
+    features = torch.randn(2 * REFERENCE, 2, 4, generator=generator)
+    features[:REFERENCE, 1] = features[:REFERENCE, 0]
+    env = make(FeedEnv, QueryPool(features), batch=80, skip="free")
+    offers = features[REFERENCE :: REFERENCE // 80][:80]
+    rank = OfferRank(env, information_gain)(env.reset()["samples"], offers, torch.ones(80, 1))
+    assert float(rank.mean()) == pytest.approx(0.75, abs=0.05)
+    assert rank.amin() > 0.5
 
 
 def test_rank_keeps_scores_only_while_the_belief_stays(pool: QueryPool) -> None:

@@ -29,6 +29,8 @@ def settings_of(setup: str = "feed", policy: str = "scorer", **training: Any) ->
         "tau": "noisy",
         "seed": 0,
         "device": "cpu",
+        "threads": 1,
+        "overrides": [],
         "objective": "alignment",
         "skip": "free",
         "tau_spread": 1,
@@ -99,21 +101,21 @@ def test_resumed_run_equals_an_uninterrupted_one_bit_for_bit(
                 load_weights(trainer.policy, checkpoint)
                 torch.rand(7)  # whatever else used the global generator
                 trainer.load_state_dict(checkpoint.training)
-            finished = trainer.run(
+            trainer.run(
                 tmp_path / f"run{len(stops)}",
                 lambda s=settings, k=task, t=trainer, p=path: make_checkpoint(s, k, t).save(p),
             )
-            assert finished
         results.append(Checkpoint.load(path))
     whole, resumed = results
     assert same(whole.weights, resumed.weights)
     for name in ("update", "optimizer", "sessions", "env_generator", "global_generator"):
         assert same(whole.training[name], resumed.training[name]), name
-    for name, values in whole.history.items():
+    for name, values in whole.progress.history.items():
         if name.startswith("train/"):
-            assert same(values, resumed.history[name])
-    csv = [sorted((tmp_path / f"run{n}" / "csv").rglob("alignment.csv"))[0] for n in (0, 2)]
-    assert csv[0].read_text() == csv[1].read_text()
+            assert same(values, resumed.progress.history[name])
+    tables = [(tmp_path / f"run{n}" / "training.csv").read_text() for n in (0, 2)]
+    untimed = [[row.split(",")[:6] for row in table.splitlines()] for table in tables]
+    assert untimed[0] == untimed[1]
 
 
 def test_a2c_learns_what_the_feed_rewards(tmp_path: Path) -> None:
@@ -131,10 +133,8 @@ def test_a2c_learns_what_the_feed_rewards(tmp_path: Path) -> None:
 @pytest.mark.parametrize("skip", ["free", "regret"])
 def test_gamma_counts_questions_where_skips_are_free(skip: str) -> None:
     trainer, _ = trainer_of({**settings_of(gamma=0.5, lmbda=0.0, steps=20), "skip": skip})
-    batch = next(iter(trainer.collector))
-    critic = trainer.policy.critic
-    with torch.no_grad():
-        later = critic(batch["next"].clone())["state_value"]
+    batch = trainer.sessions.collect()
+    later = batch["next", "state_value"]
     trainer.update(batch)
     asked = batch["action"].unsqueeze(-1) == 1
     assert asked.any()
@@ -144,6 +144,48 @@ def test_gamma_counts_questions_where_skips_are_free(skip: str) -> None:
     assert torch.allclose(batch["value_target"], target, atol=1e-3)
 
 
+@pytest.mark.parametrize("policy", ["scorer", "attention", "paper"])
+@pytest.mark.parametrize(
+    ("setup", "skip"), [("query", "free"), ("feed", "free"), ("feed", "regret")]
+)
+def test_a_batch_has_the_values_of_each_state_and_the_next(
+    setup: str, skip: str, policy: str
+) -> None:
+    """In mid-session, at its end, and where it was cut off; whatever is remembered of a belief."""
+    trainer, _ = trainer_of({**settings_of(setup, policy, steps=11), "skip": skip})
+    step, states = trainer.env.step_and_maybe_reset, []
+
+    def spy(session: Any) -> Any:
+        session, following = step(session)
+        states.append(session.clone())
+        return session, following
+
+    def skip_often(session: Any) -> Any:
+        return strategy(session).set("action", (torch.rand(4) < 0.3).long())
+
+    strategy = trainer.policy.strategy
+    trainer.sessions.strategy = skip_often
+    trainer.env.step_and_maybe_reset = spy  # type: ignore[method-assign]
+    trainer.sessions.collect()  # sessions are in mid-course then
+    states.clear()
+    batch = trainer.sessions.collect()
+    whole = torch.stack(states, 1)
+    with torch.no_grad():
+        now = trainer.policy.critic(whole.clone())["state_value"]
+        later = trainer.policy.critic(whole["next"].clone())["state_value"]
+    assert torch.allclose(batch["state_value"], now, atol=1e-5)
+    counts = ~whole["next", "terminated"]
+    assert torch.allclose(batch["next", "state_value"][counts], later[counts], atol=1e-5)
+    assert whole["next", "done"].any()
+    assert skip != "regret" or whole["next", "truncated"].any()
+    for key in ("reward", "done", "terminated", "n_asked"):
+        assert torch.equal(batch["next", key], whole["next", key])
+    ended = batch["next", "done"]
+    length = "n_offered" if setup == "feed" else "n_asked"
+    assert torch.equal(batch["next", "step_count"][ended], whole["next", length][ended])
+    assert not {"samples", "human", "history"} & set(batch.keys()) or policy == "attention"
+
+
 def test_critic_steps_bring_the_critic_to_the_returns() -> None:
     """Without them it still forecasts far too little when the policy begins to learn from it."""
     errors = []
@@ -151,13 +193,12 @@ def test_critic_steps_bring_the_critic_to_the_returns() -> None:
         constants = {"sessions": 32, "steps": None, "optimizer": "adam", "learning_rate": 0.001}
         settings = settings_of("query", critic_steps=critic_steps, warm_up=20, **constants)
         trainer, _ = trainer_of(settings)
-        batches = iter(trainer.collector)
-        for _ in range(8):
-            trainer.update(next(batches))
-        batch = next(batches)  # whole sessions, from the first question to the last
+        for _ in range(12):
+            trainer.update(trainer.sessions.collect())
+        batch = trainer.sessions.collect()  # whole sessions, from the first question to the last
         returns = batch["next", "episode_reward"][:, -1]
         with torch.no_grad():
-            forecast = trainer.policy.critic(batch.clone())["state_value"][:, 0]
+            forecast = trainer.policy.value(batch.clone())["state_value"][:, 0]
         errors.append(float((returns - forecast).mean().abs()))
     plain, fitted = errors
     assert fitted < 0.1
@@ -167,7 +208,7 @@ def test_critic_steps_bring_the_critic_to_the_returns() -> None:
 @pytest.mark.parametrize("setup", ["query", "feed"])
 def test_a_batch_has_the_steps_a_session_may_take(setup: str) -> None:
     trainer, _ = trainer_of(settings_of(setup, steps=None))
-    batch = next(iter(trainer.collector))
+    batch = trainer.sessions.collect()
     assert batch.shape == (4, 4 if setup == "query" else 20)
     assert batch["next", "done"].any(1).all()
 
@@ -195,11 +236,10 @@ def test_warm_up_spares_the_actor_and_the_average_follows() -> None:
     def raw() -> torch.Tensor:
         return torch.cat([p.detach().flatten().clone() for _, p in weights.named_parameters()])
 
-    batches = iter(trainer.collector)
     actor, expected = part("actor"), raw()
     for update in range(4):
         critic = part("critic")
-        trainer.update(next(batches))
+        trainer.update(trainer.sessions.collect())
         trainer.progress.update += 1
         assert torch.equal(part("actor"), actor) == (update < 2)
         assert not torch.equal(part("critic"), critic)
@@ -288,5 +328,5 @@ def test_rows_after_the_last_checkpoint_are_written_once(tmp_path: Path) -> None
     again, _ = trainer_of(settings)
     again.load_state_dict(states[0])
     again.run(tmp_path, lambda: None)
-    rows = (tmp_path / "csv" / "scalars" / "time" / "frames_per_second.csv").read_text()
-    assert [int(row.split(",")[0]) for row in rows.splitlines()] == [1, 2, 3, 4, 5]
+    rows = (tmp_path / "training.csv").read_text().splitlines()[1:]
+    assert [int(row.split(",")[0]) for row in rows] == [1, 2, 3, 4, 5]

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torchrl.modules import MLP
 
-from torchrl_pref.belief import covariance_of
+from torchrl_pref.resampling import covariance_of
 
 WIDTH, HEADS = 32, 4
 

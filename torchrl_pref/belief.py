@@ -4,52 +4,56 @@ Shapes: S sessions, M samples, H answers, K options per query, D features.
 
 The prior is uniform on the unit sphere: alignment ignores the scale of ω, and tau carries it.
 After each answer the samples take a step of *resample-move* (Gilks and Berzuini, 2001): reweight by
-the likelihood of the new answer, resample, then move every sample with Markov steps that leave the
+the likelihood of the new answer, resample, then move every sample with Markov moves that leave the
 new posterior invariant (see ``sampler.py``). An answer that too few samples agree with is let in by
-stages, see :meth:`Belief.update`.
+stages, and one that hardly any sample foresaw makes the belief begin anew from the prior, see
+:meth:`Belief.update`.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch import Generator, Tensor
 from torch.nn import functional as F
 
-from torchrl_pref.errors import check_count
+from torchrl_pref.errors import check_count, check_type
+from torchrl_pref.resampling import kish_share, resample
 from torchrl_pref.responses import ResponseModel
-from torchrl_pref.sampler import great_circle_step
-
-MAX_STAGES = 12
-"""Twelve stages that keep a quarter each: what no sample agrees with then is a contradiction."""
-
-MOVED = 2**18
-"""Samples that are moved at once: bounds memory whatever the number of sessions."""
+from torchrl_pref.sampler import Target, round_of_moves
+from torchrl_pref.tensors import check_finite, check_range
 
 MIN_SHARE = 0.25
 """Kish effective share of the samples that a reweighting must keep; below it a stage is added."""
+
+MAX_STAGES = 12
+"""Of one answer: twelve stages that keep a quarter each leave less than one in ten million."""
+
+SURPRISE = 0.1
+"""A soft answer that the belief held for less likely makes it begin anew. If the belief is right,
+that is rarer still."""
+
+RESTART_SHARE, RESTART_STAGES = 0.5, 500
+"""What each stage of a new beginning keeps, and how many stages there may be: it must find every
+mode, and how much each holds."""
+
+FORGOTTEN = 0.85
+"""Moves are repeated until the effective sample size is this share of the samples, at most
+``MAX_ROUNDS`` times."""
+
+MAX_ROUNDS = 5
+
+MOVED = 2**20
+"""Moves of samples that are made at once: bounds memory whatever the number of sessions."""
 
 
 def uniform_sphere(shape: tuple[int, ...], generator: Generator) -> Tensor:
     """Draw weights uniformly on the unit sphere, (… D), on the generator's device."""
     normal = torch.randn(shape, generator=generator, device=generator.device)
     return F.normalize(normal, dim=-1)
-
-
-def orthonormal(n: int, shape: torch.Size, generator: Generator) -> Tensor:
-    """Random unit vectors (n … D) for a shape (… D), each at right angles to those before it.
-
-    They come in frames of D: moves along them, preconditioned, undo nothing of each other, so that
-    n = D of them do what half as many again do in independent directions.
-    """
-    vectors = torch.randn((n, *shape), generator=generator, device=generator.device)
-    for i in range(n):
-        for j in range(i - i % shape[-1], i):
-            vectors[i] -= (vectors[i] * vectors[j]).sum(-1, keepdim=True) * vectors[j]
-        vectors[i] = F.normalize(vectors[i], dim=-1)
-    return vectors
 
 
 def feature_gaps(queries: Tensor, answers: Tensor) -> Tensor:
@@ -61,8 +65,12 @@ def feature_gaps(queries: Tensor, answers: Tensor) -> Tensor:
 
     Returns:
         (… K-1 D). Zero where there is no answer, which makes that likelihood constant in ω.
+
+    Raises:
+        InputError: an answer is no whole number from -1 to K-1.
     """
     n_options = queries.shape[-2]
+    answers = check_range("answers", answers, -1, n_options - 1, "options from 0, -1 where none")
     shifts = torch.arange(1, n_options, device=queries.device)
     others = (answers.unsqueeze(-1) + shifts) % n_options
     chosen = torch.take_along_dim(queries, answers.clamp(min=0)[..., None, None], -2)
@@ -87,17 +95,20 @@ class Belief:
     Args:
         response_model: how the belief thinks the human answers. It may differ from how they do.
         samples: M, at least 2.
-        moves: Markov steps after each resampling, at least 1. More moves, higher effective sample
-            size, more time.
+        moves: Markov moves after each resampling, at least 1; None: as many as there are features,
+            and at least 4. They are repeated where the samples have not forgotten where they were.
 
     Raises:
-        InputError: ``samples`` or ``moves`` is too small.
+        InputError: there is no response model, or ``samples`` or ``moves`` is too small.
     """
 
-    def __init__(self, response_model: ResponseModel, samples: int = 100, moves: int = 4) -> None:
+    def __init__(
+        self, response_model: ResponseModel, samples: int = 100, moves: int | None = None
+    ) -> None:
+        check_type("response_model", response_model, ResponseModel, "Boltzmann(2.0)")
         self.response_model = response_model
         self.n_samples = check_count("belief.samples", samples, 2)
-        self.n_moves = check_count("belief.moves", moves, 1)
+        self.n_moves = None if moves is None else check_count("belief.moves", moves, 1)
 
     def prior(self, n_sessions: int, n_features: int, generator: Generator) -> Tensor:
         """Samples of the prior, (S M D)."""
@@ -113,9 +124,14 @@ class Belief:
         a slack, the smallest that keeps ``MIN_SHARE`` of the samples effective, and the stages end
         at a slack of zero, which is the exact posterior.
 
+        An answer that hardly any sample foresaw says that most of the posterior may lie where there
+        are no samples, which no move would mend. The belief then begins anew from the prior, with
+        more samples, and lets in all answers together, by a power of their likelihood that rises to
+        one (Neal, *Annealed importance sampling*, 2001).
+
         The effective sample size follows the samples through it all. Resampling multiplies the
-        variance of the mean by the average multiplicity :math:`\sum_i n_i^2 / M`; moves with
-        correlation :math:`\rho` between a sample's place before and after leave :math:`\rho^2` of
+        variance of the mean, by the average multiplicity where all samples count alike; moves after
+        which a share of the variance is still explained by the places before leave that share of
         the excess. M divided by that inflation is the size of an independent sample as good for
         estimating the mean.
 
@@ -126,8 +142,12 @@ class Belief:
                 ignored, H may be 0.
             newest: (S K-1 D), feature gaps of the answer to condition on.
             generator: the source of all randomness, on the device of the samples.
+
+        Raises:
+            InputError: a sample or a gap is not finite.
         """
-        size = max(1, MOVED // self.n_samples)
+        check_finite("samples or feature gaps", samples, earlier, newest)
+        size = max(1, MOVED // (self.n_samples * self._moves_for(samples.shape[-1])))
         updates = []
         for first in range(0, max(1, len(samples)), size):
             some = slice(first, first + size)
@@ -135,119 +155,174 @@ class Belief:
             updates.append(self._update(*session, generator))
         return Update(*(torch.cat(field) for field in zip(*updates, strict=True)))
 
+    def _moves_for(self, n_features: int) -> int:
+        """V, moves along one frame of directions at least."""
+        return max(4, n_features) if self.n_moves is None else self.n_moves
+
     def _update(
         self, samples: Tensor, ess: Tensor, earlier: Tensor, newest: Tensor, generator: Generator
     ) -> Update:
         """:meth:`update` for as many sessions as are held in memory at once."""
-        result = samples.clone()
+        answers = torch.cat([earlier, newest.unsqueeze(1)], 1)
+        foreseen = self.response_model.log_likelihood(_gaps(samples, newest))
+        # Where an answer can be impossible no power of its likelihood makes it less so.
+        possible = foreseen.isfinite().all(1)
+        surprised = possible & (foreseen.exp().mean(1) < SURPRISE)
         inflation = self.n_samples / ess
-        slack = torch.full_like(ess, math.inf)
+        if not surprised.any():
+            after = self._let_in(samples, inflation, answers, generator)
+        else:
+            after = samples.clone(), inflation, torch.ones_like(surprised)
+            for who, condition in ((~surprised, self._let_in), (surprised, self._begin_anew)):
+                if who.any():
+                    some = condition(samples[who], inflation[who], answers[who], generator)
+                    for whole, part in zip(after, some, strict=True):
+                        whole[who] = part
+        return Update(after[0], self.n_samples / after[1], after[2])
+
+    def _let_in(
+        self, samples: Tensor, inflation: Tensor, answers: Tensor, generator: Generator
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Let in the last of the answers, by a slack that falls to zero.
+
+        Returns:
+            Samples (S M D), inflation (S), and whether the answer was used (S): one that no sample
+            agrees with in the end contradicts the earlier ones.
+        """
+        model, before = self.response_model, (samples, inflation)
+        samples, inflation = samples.clone(), inflation.clone()
+        slack = torch.full_like(inflation, math.inf)
         todo = torch.arange(len(samples), device=samples.device)
+        staged = torch.zeros_like(slack, dtype=torch.bool)
         for stage in range(MAX_STAGES):
             if todo.numel() == 0:
                 break
-            gaps = torch.einsum("smd,skd->smk", result[todo], newest[todo])
-            log_now = self._log_likelihood(gaps, slack[todo])
+            gaps = _gaps(samples[todo], answers[todo, -1])
+            log_now = self._log_raised(gaps, slack[todo])
             next_slack = self._next_slack(gaps, slack[todo], log_now)
             if stage == MAX_STAGES - 1:
                 # Better a few copies than no answer: only an impossible one is left out.
-                possible = self._log_likelihood(gaps, torch.zeros_like(next_slack)) > -math.inf
+                possible = self._log_raised(gaps, torch.zeros_like(next_slack)) > -math.inf
                 next_slack = torch.where(possible.any(1), 0.0, next_slack)
             slack[todo] = next_slack
-            log_weights = self._log_likelihood(gaps, slack[todo]) - log_now
-            answers = torch.cat([earlier[todo], newest[todo].unsqueeze(1)], 1)
-            result[todo], inflation[todo] = self._resample_move(
-                result[todo], inflation[todo], log_weights, answers, slack[todo], generator
-            )
-            todo = todo[slack[todo] > 0]
+            log_weights = self._log_weights(gaps, next_slack, log_now)
+            target = Target(answers[todo], next_slack, torch.ones_like(next_slack), model)
+            given = samples[todo], inflation[todo], log_weights, target, generator
+            samples[todo], inflation[todo] = self._resample_move(*given)
+            todo = todo[next_slack > 0]
+            staged[todo] = True
         used = slack == 0
-        return Update(
-            torch.where(used[:, None, None], result, samples),
-            torch.where(used, self.n_samples / inflation, ess),
-            used,
+        if staged.any():
+            # In float64, where one gap and its negative differ by nothing that counts.
+            gaps = _gaps(samples.double(), answers.double())
+            agrees = model.agrees(gaps[:, :, -1]) & (model.joint_log_likelihood(gaps) > -math.inf)
+            used &= agrees.any(1) | ~staged
+            samples = torch.where(used[:, None, None], samples, before[0])
+            inflation = torch.where(used, inflation, before[1])
+        return samples, inflation, used
+
+    def _begin_anew(
+        self, samples: Tensor, inflation: Tensor, answers: Tensor, generator: Generator
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Let in all answers from the prior, by a power of their likelihood that rises to one.
+
+        What the samples were before does not matter.
+
+        Returns:
+            Samples (S M D), inflation (S), and that the answer was used (S).
+        """
+        model = self.response_model
+        samples = self.prior(len(samples), samples.shape[2], generator)
+        inflation, power = torch.ones_like(inflation), torch.zeros_like(inflation)
+        todo = torch.arange(len(samples), device=samples.device)
+        for stage in range(RESTART_STAGES):
+            if todo.numel() == 0:
+                break
+            likelihood = model.joint_log_likelihood(_gaps(samples[todo], answers[todo]))
+            now = power[todo]
+            next_power = self._next_power(likelihood, now)
+            if stage == RESTART_STAGES - 1:
+                next_power = torch.ones_like(now)
+            power[todo] = next_power
+            log_weights = (next_power - now).unsqueeze(1) * likelihood
+            target = Target(answers[todo], torch.zeros_like(now), next_power, model)
+            given = samples[todo], inflation[todo], log_weights, target, generator
+            samples[todo], inflation[todo] = self._resample_move(*given)
+            todo = todo[next_power < 1]
+        return samples, inflation, torch.ones_like(power, dtype=torch.bool)
+
+    def _next_power(self, likelihood: Tensor, power: Tensor) -> Tensor:
+        """(S), the largest power of the likelihood (S M) that keeps enough samples effective."""
+        return _furthest(
+            power,
+            torch.ones_like(power),
+            lambda to: kish_share((to - power).unsqueeze(1) * likelihood) >= RESTART_SHARE,
         )
 
-    def _log_likelihood(self, gaps: Tensor, slack: Tensor) -> Tensor:
+    def _log_raised(self, gaps: Tensor, slack: Tensor) -> Tensor:
         """(S M), of one answer with gaps (S M K-1) raised by slack (S); infinite slack gives 0."""
         raised = gaps + slack.nan_to_num(posinf=0.0)[:, None, None]
         log_likelihood = self.response_model.log_likelihood(raised)
         return log_likelihood.masked_fill(slack.isinf()[:, None], 0.0)
 
+    def _log_weights(self, gaps: Tensor, slack: Tensor, log_now: Tensor) -> Tensor:
+        """(S M), of samples with log-likelihoods (S M) when an answer's slack becomes this (S)."""
+        # By rounding a sample may lie just outside of where it was moved to, and is dropped.
+        return self._log_raised(gaps, slack) - log_now.clamp(min=torch.finfo(log_now.dtype).min)
+
     def _next_slack(self, gaps: Tensor, slack: Tensor, log_now: Tensor) -> Tensor:
-        """(S), the smallest slack that keeps enough of the samples effective, by bisection."""
-
-        def keeps_enough(candidate: Tensor) -> Tensor:
-            log_weights = self._log_likelihood(gaps, candidate) - log_now
-            return kish_share(log_weights) >= MIN_SHARE
-
-        low = torch.zeros_like(slack)
-        enough = keeps_enough(low)
-        if enough.all():
-            return low
-        # At this slack every sample agrees, so the weights differ by a factor of at most K.
-        high = torch.minimum(slack, (-gaps).amax((1, 2)).clamp(min=0))
-        for _ in range(25):
-            middle = (low + high) / 2
-            fits = keeps_enough(middle)
-            low, high = torch.where(fits, low, middle), torch.where(fits, middle, high)
-        return torch.where(enough, 0.0, high)
+        """(S), the smallest slack that keeps enough of the samples effective."""
+        result = torch.zeros_like(slack)
+        few = kish_share(self._log_weights(gaps, result, log_now)) < MIN_SHARE
+        if few.any():
+            gaps, log_now = gaps[few], log_now[few]
+            # At this slack every sample agrees, so the weights differ by a factor of at most K.
+            start = torch.minimum(slack[few], (-gaps).amax((1, 2)).clamp(min=0))
+            result[few] = _furthest(
+                start,
+                torch.zeros_like(start),
+                lambda to: kish_share(self._log_weights(gaps, to, log_now)) >= MIN_SHARE,
+            )
+        return result
 
     def _resample_move(
         self,
         samples: Tensor,
         inflation: Tensor,
         log_weights: Tensor,
-        answers: Tensor,
-        slack: Tensor,
+        target: Target,
         generator: Generator,
     ) -> tuple[Tensor, Tensor]:
         """New samples (S M D) and the inflation (S) of the variance of their mean."""
-        chosen = systematic_resample(log_weights, generator)
-        copies = torch.zeros_like(log_weights).scatter_add_(1, chosen, torch.ones_like(log_weights))
-        inflation = inflation * copies.square().mean(1)
-        start = samples.gather(1, chosen.unsqueeze(-1).expand_as(samples))
-        # Circles are turned to where the samples spread. Each sample is 1/M of that spread:
-        # adaptive, and exact only as M grows. The floor keeps every direction possible.
-        covariance = covariance_of(start)
-        floor = 1e-6 * covariance.diagonal(dim1=-2, dim2=-1).amax(-1).clamp(min=1e-12)
-        covariance.diagonal(dim1=-2, dim2=-1).add_(floor.unsqueeze(-1))
-        scale = torch.linalg.cholesky_ex(covariance).L
-        moved = start
-        for directions in orthonormal(self.n_moves, start.shape, generator):
-            # As long as a Gaussian with this covariance is wide in the direction of the pole.
-            poles = directions @ scale.mT
-            moved = great_circle_step(moved, poles, answers, slack, self.response_model, generator)
-        kept = _correlation(start, moved).clamp(min=0).square()
-        return moved, (1 + kept * (inflation - 1)).clamp(max=self.n_samples)
+        start, factor = resample(samples, log_weights, generator)
+        excess = inflation * factor - 1
+        n_moves = self._moves_for(samples.shape[2])
+        moved, explained = round_of_moves(start, start, n_moves, target, generator)
+        inflation = 1 + explained * excess
+        for _ in range(MAX_ROUNDS - 1):
+            who = (inflation > 1 / FORGOTTEN).nonzero().squeeze(-1)
+            if who.numel() == 0:
+                break
+            again = start[who], moved[who], n_moves, target.of(who)
+            moved[who], explained = round_of_moves(*again, generator)
+            inflation[who] = 1 + explained * excess[who]
+        return moved, inflation.clamp(1, samples.shape[1])
 
 
-def kish_share(log_weights: Tensor) -> Tensor:
-    """Kish's effective share of weighted samples, (Σw)² / (M Σw²), for log-weights (… M)."""
-    highest = log_weights.amax(-1, keepdim=True)
-    weights = (log_weights - highest.nan_to_num(neginf=0.0)).exp()
-    total, square = weights.sum(-1).square(), weights.square().sum(-1)
-    return total / (square * log_weights.shape[-1]).clamp(min=1e-30)
+def _gaps(samples: Tensor, feature_gaps: Tensor) -> Tensor:
+    """Return gaps (S M … K-1) under samples (S M D), from feature gaps (S … K-1 D)."""
+    rows = feature_gaps.flatten(1, -2)
+    return (samples @ rows.mT).unflatten(-1, feature_gaps.shape[1:-1])
 
 
-def systematic_resample(log_weights: Tensor, generator: Generator) -> Tensor:
-    """Indices (S M) of samples drawn in proportion to their weights (S M) with one uniform each."""
-    n_samples = log_weights.shape[-1]
-    cumulative = log_weights.softmax(-1).cumsum(-1, dtype=torch.float64)
-    offset = torch.rand((len(log_weights), 1), generator=generator, device=log_weights.device)
-    steps = torch.arange(n_samples, device=log_weights.device)
-    points = (steps + offset.double()) / n_samples * cumulative[:, -1:]
-    return torch.searchsorted(cumulative, points).clamp(max=n_samples - 1)
-
-
-def covariance_of(samples: Tensor) -> Tensor:
-    """Covariance (… D D) of belief samples (… M D)."""
-    centred = samples - samples.mean(-2, keepdim=True)
-    return centred.mT @ centred / samples.shape[-2]
-
-
-def _correlation(before: Tensor, after: Tensor) -> Tensor:
-    """(S), correlation of the samples' places, summed over features."""
-    before = before - before.mean(1, keepdim=True)
-    after = after - after.mean(1, keepdim=True)
-    spread = before.square().sum((1, 2)) * after.square().sum((1, 2))
-    return (before * after).sum((1, 2)) / spread.sqrt().clamp(min=1e-20)
+def _furthest(start: Tensor, end: Tensor, fits: Callable[[Tensor], Tensor]) -> Tensor:
+    """(S), the end where it fits, else as near to it as fits: bisection from a start that fits."""
+    reached = fits(end)
+    if reached.all():
+        return end
+    beyond = end
+    for _ in range(30):
+        middle = (start + beyond) / 2
+        enough = fits(middle)
+        start, beyond = torch.where(enough, middle, start), torch.where(enough, beyond, middle)
+    return torch.where(reached, end, start)

@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
+from torchrl_pref.contents import check_content
 from torchrl_pref.errors import InputError
 from torchrl_pref.features import Normalizer
-from torchrl_pref.queries import QueryPool, load_safely, save_atomically
+from torchrl_pref.files import load_safely
+from torchrl_pref.progress import Progress
+from torchrl_pref.queries import QueryPool, save_atomically
+from torchrl_pref.runs import CHECKPOINT
 
 KIND = "torchrl_pref checkpoint"
-FILE_NAME = "checkpoint.pt"
 
 FORMAT = 4
 """Raised whenever a key of the settings or of the checkpoint changes its meaning or its name."""
+
+
+def picks_by_index(settings: dict[str, Any]) -> bool:
+    """Whether a policy of these settings picks an index of its training pool."""
+    return bool(settings["policy"]["name"] == "paper" and settings["setup"]["name"] == "query")
 
 
 @dataclass
@@ -49,16 +58,14 @@ class Checkpoint:
         return Normalizer(self.mean, self.std)
 
     @property
-    def history(self) -> dict[str, list[float]]:
-        """What was logged at each update, by metric name; NaN where no episode ended."""
-        return self.training["history"]
+    def progress(self) -> Progress:
+        """How the training went."""
+        return Progress.of(self.training)
 
     @property
     def picks_by_index(self) -> bool:
         """Whether the policy picks an index of its training pool, as the paper's query policy."""
-        return self.settings["policy"]["name"] == "paper" and (
-            self.settings["setup"]["name"] == "query"
-        )
+        return picks_by_index(self.settings)
 
     def save(self, path: str | Path) -> None:
         """Write the checkpoint, whole or not at all."""
@@ -69,17 +76,24 @@ class Checkpoint:
         """Read a checkpoint from a file or from the folder of a run, with ``weights_only=True``.
 
         Raises:
-            InputError: it is missing, cut off, or written by something else.
+            InputError: it is missing, cut off, spoiled, or written by something else.
         """
-        path = Path(path)
-        content = load_safely(path / FILE_NAME if path.is_dir() else path, KIND)
+        file = Path(path) / CHECKPOINT if os.path.isdir(path) else path
+        content = load_safely(file, KIND)
         content.pop("kind")
         found = content.pop("format", None)
-        if found != FORMAT or set(content) != set(cls.__dataclass_fields__):
+        version = found if type(found) is int and 0 <= found < 1000 else "unknown"
+        if version != FORMAT or set(content) != set(cls.__dataclass_fields__):
             raise InputError(
-                f"{path}: written by another version of this package (format {found}, expected "
+                f"{path}: written by another version of this package (format {version}, expected "
                 f"{FORMAT}); train again, or use the version that wrote it"
             )
+        try:
+            check_content(content)
+        except InputError as error:
+            raise InputError(
+                f"{path}: {error}; restore a copy of the file, or train again"
+            ) from None
         return cls(**content)
 
     def check_fits(self, pool: QueryPool, own_indices: bool = False) -> None:

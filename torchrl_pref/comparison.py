@@ -21,6 +21,7 @@ from torchrl_pref.experiment import (
     make_feed_env,
     make_query_env,
 )
+from torchrl_pref.memory import check_memory
 from torchrl_pref.policies import Policy
 from torchrl_pref.queries import QueryPool
 from torchrl_pref.strategies import Greedy, QuantileAsk, RandomAsk, RandomQuery
@@ -45,7 +46,7 @@ def evaluate_panels(
     pool. It is evaluated on the held-out pool all the same, and on its own pool in a second panel.
 
     Args:
-        settings: the sections ``setup``, ``belief``, ``evaluation`` and ``device``.
+        settings: of the evaluation, or of the training that it ends.
         task: the pools and the response model.
         learned: checkpoints to evaluate, by the name to show.
         test: another held-out pool, normalised; by default the task's.
@@ -54,6 +55,8 @@ def evaluate_panels(
         By title: by name of the strategy, what it did.
     """
     held_out = task.test if test is None else test
+    evaluated = {key: value for key, value in settings.items() if key != "training"}
+    check_memory(evaluated, *held_out.features.shape)
     if not any(checkpoint.picks_by_index for checkpoint in learned.values()):
         return {task.title: compare(settings, task, held_out, learned)}
     return {
@@ -66,9 +69,11 @@ def check_evaluation(settings: Settings) -> tuple[int, int]:
     """How many humans, and their seed; call it before a training whose result they will judge.
 
     Raises:
-        InputError: they are too few, or the seed is out of range.
+        InputError: they are too few, or the seed or the evaluations during training are out of
+            range.
     """
     section = settings["evaluation"]
+    check_count("evaluation.during", section.get("during", 0), 0)
     n_humans = check_count("evaluation.humans", section["humans"], 2)
     return n_humans, FIRST_EVALUATION_SEED + check_seed("evaluation.seed", section["seed"])
 

@@ -30,7 +30,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -41,10 +41,25 @@ from torchrl.envs import EnvBase
 
 from torchrl_pref.acquisition import information_gain, score_queries
 from torchrl_pref.belief import Belief, feature_gaps
-from torchrl_pref.errors import InputError, check_choice, check_count, check_flag
+from torchrl_pref.errors import (
+    InputError,
+    check_choice,
+    check_count,
+    check_flag,
+    check_type,
+)
 from torchrl_pref.humans import SimulatedHuman
 from torchrl_pref.objectives import make_objective
 from torchrl_pref.queries import QueryPool
+from torchrl_pref.sessions import check_state
+from torchrl_pref.tensors import check_range, check_shape
+
+State: TypeAlias = TensorDict | dict[str, Any]
+"""A state: a dictionary while a step makes it, as writing to a tensordict takes time."""
+
+
+NESTED = ("human", "history", "metrics")
+"""What of a state holds several tensors."""
 
 
 class SessionEnv(EnvBase):
@@ -66,6 +81,11 @@ class SessionEnv(EnvBase):
     ) -> None:
         if not isinstance(batch_size, Sequence) or len(batch_size) != 1:
             raise InputError(f"batch_size={batch_size}: expected one size, such as (64,)")
+        check_count("batch_size", batch_size[0], 1)
+        check_type("pool", pool, QueryPool, "QueryPool(features)")
+        check_type("human", human, SimulatedHuman, "SimulatedHuman(Boltzmann(2.0))")
+        check_type("belief", belief, Belief, "Belief(Boltzmann(2.0))")
+        check_count("seed", seed, 0)
         super().__init__(device=device, batch_size=torch.Size(batch_size))
         self.register_buffer("features", pool.features.to(device))
         self.human = human
@@ -78,7 +98,7 @@ class SessionEnv(EnvBase):
     def _make_specs(self, n_actions: int) -> None:
         """Read the specs off a state, so that no shape is written down twice."""
         rng_state = self._generator.get_state()
-        state = self._observe(self._fresh_state())
+        state = self._start(self._fresh_state())
         self._generator.set_state(rng_state)
         self.observation_spec = _spec_of(state)
         self.state_spec = _spec_of(state.select(*self._state_keys))
@@ -110,9 +130,14 @@ class SessionEnv(EnvBase):
     ) -> TensorDictBase:
         state = self._fresh_state()
         if set_state and tensordict is not None:
-            given = tensordict.select(*state.keys(True, True), strict=False)
-            state.update(given.to(self.device).clone())
-        return self._observe(state)
+            state.update(check_state(tensordict, state, len(self.features)).clone())
+        return self._start(state)
+
+    def _check_action(self, tensordict: TensorDictBase, n_actions: int, meaning: str) -> Tensor:
+        """The action (B) of each session; refused unless it is from 0 to ``n_actions`` - 1."""
+        action = check_range("action", tensordict.get("action"), 0, n_actions - 1, meaning)
+        check_shape("action", action, self.batch_size, "one number for each session")
+        return action
 
     def _fresh_state(self) -> TensorDict:
         """New humans who have answered nothing. The draws that strategies share come first."""
@@ -134,59 +159,74 @@ class SessionEnv(EnvBase):
             device=device,
         )
 
-    def _observe(self, state: TensorDict) -> TensorDict:
-        """Add to a state what follows from it. Subclasses add what is on the table."""
-        samples, omega = state["samples"], state["human", "omega"]
-        mean = samples.mean(1)
-        cosines = F.cosine_similarity(samples, omega.unsqueeze(1), dim=-1)
-        state["mean"] = mean
+    def _start(self, state: TensorDict) -> TensorDict:
+        """The observed first state, from what was drawn or given."""
+        state["mean"], measured = _measure(state["samples"], state["human", "omega"])
+        state["metrics"].update(measured)
+        self._observe(state)
+        return state
+
+    def _observe(self, state: State) -> None:
+        """Add to a state what follows from its counts. Subclasses add what is on the table."""
         state["remaining"] = 1 - state["n_asked"] / self.budget
-        state["metrics", "alignment"] = cosines.mean(1, keepdim=True)
-        state["metrics", "alignment_of_mean"] = F.cosine_similarity(mean, omega)[:, None]
-        return state
 
-    def _information(self, tensordict: TensorDictBase, index: Tensor) -> Tensor:
-        """(B 1), information gain in bits of pool query ``index`` (B) under the belief."""
-        queries, model = self.features[index].unsqueeze(1), self.belief.response_model
-        return score_queries(tensordict["samples"], queries, model, information_gain)
+    def _ask(self, before: TensorDictBase, index: Tensor, asked: Tensor) -> dict[str, Any]:
+        """The state after the sessions marked in ``asked`` (B) asked pool query ``index`` (B).
 
-    def _ask(
-        self, tensordict: TensorDictBase, index: Tensor, information: Tensor, asked: Tensor
-    ) -> TensorDict:
-        """The state after the sessions marked in ``asked`` (B) asked pool query ``index`` (B)."""
-        keys = [key for key in self._state_keys if key not in ("queries", "offer")]
-        state = tensordict.select(*keys).clone()
+        What stays the same is shared with the state before: a skip costs next to nothing.
+        """
+        state = {key: before[key] for key in self._state_keys}
+        for key in NESTED:
+            state[key] = dict(state[key])
         who = asked.nonzero().squeeze(-1)
-        turn = state["n_asked"][who, 0]
-        answers = self.human.respond(self.features[index[who]], state["human"][who], turn)
-
-        history = state["history"]
-        earlier = feature_gaps(self.features[history["queries"][who]], history["answers"][who])
-        newest = feature_gaps(self.features[index[who]], answers)
-        # On the CPU only as many turns as were taken are worth the work; -1 slots come last.
-        earlier = earlier[:, : int(turn.max()) if len(who) else 0]
-        update = self.belief.update(
-            state["samples"][who], state["metrics", "ess"][who, 0], earlier, newest, self.generator
-        )
-        state["samples"][who] = update.samples
-        state["metrics", "ess"][who] = update.ess.unsqueeze(-1)
-        state["metrics", "information"][who] += information[who]
-        history["queries"][who, turn] = index[who]
-        history["answers"][who, turn] = torch.where(update.used, answers, -1)
-        state["n_asked"][who] += 1
+        if len(who) == len(asked):
+            _put(state, self._answer(state, index), None)
+        elif len(who):
+            _put(state, self._answer(_rows(state, who), index[who]), who)
         return state
+
+    def _answer(self, session: dict[str, Any], index: Tensor) -> dict[str, Any]:
+        """What changes in sessions (B) that ask pool queries ``index`` (B)."""
+        human, history, metrics = (session[key] for key in NESTED)
+        queries, model = self.features[index], self.belief.response_model
+        turn, samples = session["n_asked"].squeeze(-1), session["samples"]
+        answers = self.human.respond(queries, human, turn)
+        # On the CPU only as many turns as were taken are worth the work; -1 slots come last.
+        taken = int(turn.max())
+        past, given = (history[key][:, :taken] for key in ("queries", "answers"))
+        earlier, newest = feature_gaps(self.features[past], given), feature_gaps(queries, answers)
+        ess = metrics["ess"].squeeze(-1)
+        update = self.belief.update(samples, ess, earlier, newest, self.generator)
+        mean, measured = _measure(update.samples, human["omega"])
+        gain = score_queries(samples, queries.unsqueeze(1), model, information_gain)
+        place = torch.arange(history["queries"].shape[1], device=turn.device) == turn.unsqueeze(-1)
+        used = torch.where(update.used, answers, -1)
+        return {
+            "samples": update.samples,
+            "mean": mean,
+            "n_asked": session["n_asked"] + 1,
+            "history": {
+                "queries": torch.where(place, index.unsqueeze(-1), history["queries"]),
+                "answers": torch.where(place, used.unsqueeze(-1), history["answers"]),
+            },
+            "metrics": {
+                **measured,
+                "information": metrics["information"] + gain,
+                "ess": update.ess.unsqueeze(-1),
+            },
+        }
 
     def _finish(
-        self, state: TensorDict, reward: Tensor, truncated: Tensor, terminated: Tensor
+        self, state: dict[str, Any], reward: Tensor, truncated: Tensor, terminated: Tensor
     ) -> TensorDict:
-        """Add reward and done flags to the observed next state."""
-        flags = {
-            "reward": reward,
-            "terminated": terminated,
-            "truncated": truncated & ~terminated,
-            "done": terminated | truncated,
-        }
-        return state.update(flags)
+        """The observed next state with its reward and done flags."""
+        state["reward"] = reward
+        state["terminated"] = terminated
+        state["truncated"] = truncated & ~terminated
+        state["done"] = terminated | truncated
+        for key in NESTED:
+            state[key] = TensorDict(state[key], self.batch_size, device=self.device)
+        return TensorDict(state, self.batch_size, device=self.device)
 
     @abstractmethod
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase: ...
@@ -217,7 +257,7 @@ class QueryEnv(SessionEnv):
         InputError: a number is below its minimum, or without repeats the candidates are too few.
     """
 
-    _state_keys = ("human", "samples", "history", "n_asked", "metrics", "candidates")
+    _state_keys = ("human", "samples", "mean", "history", "n_asked", "metrics", "candidates")
 
     def __init__(
         self,
@@ -254,7 +294,7 @@ class QueryEnv(SessionEnv):
             chosen = keys.topk(self.n_candidates, dim=-1).indices
         return state.set("candidates", chosen)
 
-    def _observe(self, state: TensorDict) -> TensorDict:
+    def _observe(self, state: State) -> None:
         super()._observe(state)
         candidates = state["candidates"]
         if self.n_candidates == len(self.features):
@@ -264,22 +304,31 @@ class QueryEnv(SessionEnv):
             state["queries"] = self.features[candidates]
         mask = torch.ones_like(candidates, dtype=torch.bool)
         if not self.repeats:
-            asked = state["history", "queries"]
+            asked = state["history"]["queries"]
             mask = ~(candidates.unsqueeze(-1) == asked.unsqueeze(-2)).any(-1)
             # A finished session offers everything again, so that a policy still has a distribution.
             mask = mask | ~mask.any(-1, keepdim=True)
         state["action_mask"] = mask
-        return state
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action = tensordict["action"].unsqueeze(-1)
-        index = tensordict["candidates"].gather(-1, action).squeeze(-1)
-        gain = self._information(tensordict, index)
-        asked = tensordict["n_asked"].squeeze(-1) < self.budget
-        state = self._observe(self._ask(tensordict, index, gain, asked))
+        action = self._check_action(tensordict, self.n_candidates, "the place of a candidate")
+        index = tensordict["candidates"].gather(-1, action.unsqueeze(-1)).squeeze(-1)
+        if not self.repeats:
+            self._check_new(tensordict, index)
+        state = self._ask(tensordict, index, tensordict["n_asked"].squeeze(-1) < self.budget)
+        self._observe(state)
         reward = self._objective.potential(state) - self._objective.potential(tensordict)
         terminated = state["n_asked"] >= self.budget
         return self._finish(state, reward, torch.zeros_like(terminated), terminated)
+
+    def _check_new(self, tensordict: TensorDictBase, index: Tensor) -> None:
+        """Refuse to ask pool query ``index`` (B) again in a session that goes on."""
+        again = (tensordict["history", "queries"] == index.unsqueeze(-1)).any(-1, keepdim=True)
+        if (again & (tensordict["n_asked"] < self.budget)).any():
+            raise InputError(
+                "action: a query that was asked before, where repeats=False; expected one that "
+                "action_mask allows; mask the policy, or make the environment with repeats=True"
+            )
 
 
 class FeedEnv(SessionEnv):
@@ -309,7 +358,16 @@ class FeedEnv(SessionEnv):
         InputError: a number is below its minimum, or ``on_skip`` or ``skip`` is another word.
     """
 
-    _state_keys = ("human", "samples", "history", "n_asked", "metrics", "offers", "n_offered")
+    _state_keys = (
+        "human",
+        "samples",
+        "mean",
+        "history",
+        "n_asked",
+        "metrics",
+        "offers",
+        "n_offered",
+    )
 
     def __init__(
         self,
@@ -348,26 +406,25 @@ class FeedEnv(SessionEnv):
         state["n_offered"] = torch.zeros_like(state["n_asked"])
         return state
 
-    def _offered(self, state: TensorDictBase) -> Tensor:
+    def _offered(self, state: State | TensorDictBase) -> Tensor:
         """(B), pool index of the query on offer; after the last offer, the last one."""
         place = state["n_offered" if self.on_skip == "new" else "n_asked"]
         return state["offers"].gather(-1, place.clamp(max=self.n_offers - 1)).squeeze(-1)
 
-    def _observe(self, state: TensorDict) -> TensorDict:
+    def _observe(self, state: State) -> None:
         super()._observe(state)
         offers_left = 1 - state["n_offered"] / self.n_offers
         state["remaining"] = torch.cat([state["remaining"], offers_left], -1)
         state["offer"] = self.features[self._offered(state)]
-        return state
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = self._check_action(tensordict, 2, "1 to ask and 0 to skip")
         index = self._offered(tensordict)
         going_on = (tensordict["n_asked"] < self.budget) & (tensordict["n_offered"] < self.n_offers)
-        asks = (tensordict["action"] == 1).unsqueeze(-1)
-        gain = self._information(tensordict, index) * going_on
-        state = self._ask(tensordict, index, gain, (asks & going_on).squeeze(-1))
-        state["n_offered"] += going_on
-        state = self._observe(state)
+        asks = (action == 1).unsqueeze(-1)
+        state = self._ask(tensordict, index, (asks & going_on).squeeze(-1))
+        state["n_offered"] = state["n_offered"] + going_on
+        self._observe(state)
         if self.skip == "free":
             reward = self._objective.potential(state) - self._objective.potential(tensordict)
         else:
@@ -380,6 +437,31 @@ class FeedEnv(SessionEnv):
             # Scarce offers are part of the task, and nothing is to come after the last.
             terminated = terminated | out_of_offers
         return self._finish(state, reward, out_of_offers, terminated)
+
+
+def _rows(state: dict[str, Any], who: Tensor) -> dict[str, Any]:
+    """The sessions ``who`` of a state."""
+    return {
+        key: _rows(value, who) if isinstance(value, dict) else value[who]
+        for key, value in state.items()
+    }
+
+
+def _put(state: dict[str, Any], changed: dict[str, Any], who: Tensor | None) -> None:
+    """Put what changed in sessions ``who``, or in all, into a state; no tensor is overwritten."""
+    for key, new in changed.items():
+        if isinstance(new, dict):
+            _put(state[key], new, who)
+        else:
+            state[key] = new if who is None else state[key].index_copy(0, who, new)
+
+
+def _measure(samples: Tensor, omega: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    """The mean (B D) of the samples, and the metrics (B 1) that compare them with omega (B D)."""
+    mean = samples.mean(1)
+    cosines = F.cosine_similarity(samples, omega.unsqueeze(1), dim=-1)
+    of_mean = F.cosine_similarity(mean, omega).unsqueeze(-1)
+    return mean, {"alignment": cosines.mean(1, keepdim=True), "alignment_of_mean": of_mean}
 
 
 def _spec_of(state: TensorDictBase) -> Composite:

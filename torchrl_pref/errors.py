@@ -9,6 +9,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+LONGEST = 1200
+"""Letters of an error that are shown."""
+
 
 class InputError(ValueError):
     """Input that cannot be used. The message is one line, written for the person who gave it."""
@@ -26,6 +29,20 @@ def check_count(name: str, value: Any, minimum: int) -> int:
             f"set {name}={minimum} or more"
         )
     return value
+
+
+def check_type(name: str, value: Any, kind: type, example: str) -> None:
+    """Refuse a value that is not an object of ``kind``.
+
+    Raises:
+        InputError: it is not.
+    """
+    if not isinstance(value, kind):
+        article = "an" if kind.__name__[0] in "AEIO" else "a"
+        raise InputError(
+            f"{name} of type {type(value).__name__}: expected {article} {kind.__name__}, such as "
+            f"{example}"
+        )
 
 
 def check_seed(name: str, value: Any) -> int:
@@ -62,6 +79,18 @@ def check_positive(name: str, value: Any) -> float:
     return float(value)
 
 
+def check_not_negative(name: str, value: Any) -> float:
+    """Return ``value`` as a float if it is a finite number of at least zero.
+
+    Raises:
+        InputError: it is not.
+    """
+    number = not isinstance(value, bool) and isinstance(value, (int, float))
+    if not number or not math.isfinite(value) or value < 0:
+        raise InputError(f"{name}={value!r}: expected a finite number of at least 0")
+    return float(value)
+
+
 def check_share(name: str, value: Any) -> float:
     """Return ``value`` as a float if it is a number from 0 to 1.
 
@@ -87,8 +116,11 @@ def check_choice(name: str, value: Any, choices: tuple[str, ...]) -> str:
 
 
 def one_line(error: Exception) -> str:
-    """What an error says, without its line breaks; other blanks may be of a path, and stay."""
-    return re.sub(r"\s*\n\s*", " ", str(error)).strip()
+    """What an error says, without line breaks, what a terminal would act upon, and the middle of
+    what is too long; other blanks may be of a path, and stay."""
+    text = re.sub(r"\s*\n\s*", " ", str(error)).strip()
+    text = re.sub(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]", "?", text)
+    return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} … {text[-LONGEST // 2 :]}"
 
 
 @contextmanager

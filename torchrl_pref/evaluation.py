@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -118,8 +119,15 @@ def _count_repeats(history: Tensor) -> Tensor:
 
 def bootstrap_interval(values: Tensor, seed: int = 0, resamples: int = 2000) -> tuple[float, float]:
     """Percentile bootstrap 95% interval of the mean of values (B) over humans."""
-    generator = Generator().manual_seed(seed)
-    picks = torch.randint(len(values), (resamples, len(values)), generator=generator)
-    means = values[picks].mean(-1)
+    means = _resampled_shares(len(values), seed, resamples) @ values.float()
     low, high = torch.quantile(means, torch.tensor([0.025, 0.975])).tolist()
     return low, high
+
+
+@lru_cache(maxsize=1)
+def _resampled_shares(count: int, seed: int, resamples: int) -> Tensor:
+    """The share of each human (resamples B) in each resample; the same for every curve."""
+    generator = Generator().manual_seed(seed)
+    picks = torch.randint(count, (resamples, count), generator=generator)
+    ones = torch.ones(1).expand(picks.shape)
+    return torch.zeros(picks.shape).scatter_add_(1, picks, ones) / count

@@ -6,6 +6,7 @@ things and are never code to call, so that a foreign checkpoint can do no harm.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from typing import Any
 import torch
 
 from torchrl_pref.belief import Belief, uniform_sphere
-from torchrl_pref.checkpoint import Checkpoint
+from torchrl_pref.checkpoint import Checkpoint, picks_by_index
 from torchrl_pref.envs import FeedEnv, QueryEnv
 from torchrl_pref.errors import InputError, check_choice, check_positive, check_seed
 from torchrl_pref.features import Normalizer
@@ -21,6 +22,7 @@ from torchrl_pref.humans import SimulatedHuman
 from torchrl_pref.policies import Policy, attention_policy, paper_policy, scorer_policy
 from torchrl_pref.queries import QueryPool, gridworld_pool
 from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel, calibrate_tau
+from torchrl_pref.restore import restore_weights
 from torchrl_pref.training import A2CSettings, Trainer
 
 Settings = dict[str, Any]
@@ -122,7 +124,7 @@ def reload_task(checkpoint: Checkpoint, train: Path, test: Path) -> Task:
     """The task of a run from its pool files; made again from its settings where they are gone.
 
     Raises:
-        InputError: the pools are not those that the checkpoint was trained with.
+        InputError: the pools or the human are not those that the checkpoint was trained with.
     """
     settings = checkpoint.settings
     if train.is_file() and test.is_file():
@@ -139,6 +141,13 @@ def reload_task(checkpoint: Checkpoint, train: Path, test: Path) -> Task:
                 f"the checkpoint does not fit the {name} pool: digest {pool.digest[:12]}, trained "
                 f"with {digest[:12]}; restore {train.parent}/{name}_pool.pt"
             )
+    if task.tau != checkpoint.tau and not (
+        task.tau and checkpoint.tau and math.isclose(task.tau, checkpoint.tau, rel_tol=0.01)
+    ):
+        raise InputError(
+            f"the checkpoint does not fit its settings: its human has tau={checkpoint.tau}, and "
+            f"tau={settings['tau']} makes it {task.tau}; restore a copy of the checkpoint"
+        )
     return task
 
 
@@ -166,6 +175,17 @@ def make_feed_env(
     return FeedEnv(pool, offers=setup["offers"], **kinds, **common)
 
 
+def make_training_env(
+    settings: Settings, task: Task, pool: QueryPool, sessions: int, seed: int
+) -> QueryEnv | FeedEnv:
+    """The environment in which a policy of these settings learns, on a normalised pool."""
+    if settings["setup"]["name"] == "feed":
+        return make_feed_env(settings, task, pool, sessions, seed)
+    # A policy that learns an index has the whole pool before it.
+    candidates = None if picks_by_index(settings) else settings["setup"]["candidates"]
+    return make_query_env(settings, task, pool, sessions, seed, candidates)
+
+
 def _session_arguments(settings: Settings, task: Task, sessions: int, seed: int) -> dict[str, Any]:
     """What both environments are made with."""
     belief = settings["belief"]
@@ -188,14 +208,7 @@ def make_trainer(settings: Settings, task: Task) -> Trainer:
     """
     a2c = A2CSettings(**settings["training"])
     seed = check_seed("seed", settings["seed"])
-    env: QueryEnv | FeedEnv
-    if settings["setup"]["name"] == "feed":
-        env = make_feed_env(settings, task, task.train, a2c.sessions, seed)
-    else:
-        # The paper's policy learns an index of the whole pool.
-        by_index = settings["policy"]["name"] == "paper"
-        candidates = None if by_index else settings["setup"]["candidates"]
-        env = make_query_env(settings, task, task.train, a2c.sessions, seed, candidates)
+    env = make_training_env(settings, task, task.train, a2c.sessions, seed)
     # The policy's initial weights come from the global generator.
     torch.manual_seed(seed)
     return Trainer(env, make_policy(settings, env), a2c, seed)
@@ -258,10 +271,7 @@ def load_weights(policy: Policy, checkpoint: Checkpoint) -> None:
     Raises:
         InputError: they belong to another policy or to other sizes.
     """
-    try:
-        policy.weights.load_state_dict(checkpoint.weights)
-    except RuntimeError as error:
-        raise InputError(f"the checkpoint's weights do not fit this run: {error}") from error
+    restore_weights(policy.weights, checkpoint.weights)
 
 
 def load_policy(checkpoint: Checkpoint, env: QueryEnv | FeedEnv) -> Policy:

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchrl_pref.errors import InputError
+from torchrl_pref.tensors import check_finite, check_plain
 
 
 def corner_distances(positions: Tensor, size: int) -> Tensor:
@@ -31,29 +32,33 @@ def corner_distances(positions: Tensor, size: int) -> Tensor:
 
 
 def check_features(features: Tensor) -> Tensor:
-    """Return the features of a pool as float32.
+    """Return the features of a pool as float32: a copy, without gradients.
 
     Raises:
-        InputError: the shape is not (N, K ≥ 2, D ≥ 2), or a value is NaN or infinite.
+        InputError: they are no plain real numbers, the shape is not (N, K ≥ 2, D ≥ 2), or a value
+            is NaN, infinite, or beyond float32.
     """
-    if not isinstance(features, Tensor):
-        raise InputError(
-            f"features of type {type(features).__name__}: expected a torch.Tensor; "
-            "torch.as_tensor(…) makes one of an array or of lists"
-        )
+    check_plain("features", features)
     shape = tuple(features.shape)
     if features.ndim != 3 or shape[0] < 1 or shape[1] < 2 or shape[2] < 2:
         raise InputError(
             f"features of shape {shape}: expected (N queries, K options, D features) with N at "
             "least 1, K at least 2 and D at least 2; reshape them or stack the options of a query"
         )
-    broken = (~features.isfinite()).flatten(1).any(1).nonzero().squeeze(-1)
-    if broken.numel():
-        raise InputError(
-            f"features of {broken.numel()} of {shape[0]} queries hold NaN or infinity (first: "
-            f"query {int(broken[0])}): expected finite numbers; remove or mend these queries"
-        )
-    return features.to(torch.float32)
+    # A copy: what is later written into the tensor that was given is not checked.
+    single = features.detach().as_subclass(Tensor).to(torch.float32, copy=True).contiguous()
+    for bad, what, mend in (
+        (~features.isfinite(), "NaN or infinity", "finite numbers; remove or mend these queries"),
+        (single.isinf(), "numbers beyond float32", "numbers up to 1e38; scale the features"),
+        ((single == 0) & (features != 0), "numbers that are 0 in float32", "larger ones; scale"),
+    ):
+        broken = bad.flatten(1).any(1).nonzero().squeeze(-1)
+        if broken.numel():
+            raise InputError(
+                f"features of {broken.numel()} of {shape[0]} queries hold {what} (first: "
+                f"query {int(broken[0])}): expected {mend}"
+            )
+    return single
 
 
 @dataclass(frozen=True)
@@ -73,8 +78,10 @@ class Normalizer:
         """Measure the statistics of raw features (… D).
 
         Raises:
-            InputError: a feature never varies, so no scale makes its variance one.
+            InputError: a feature is no finite number, or never varies, so that no scale makes its
+                variance one.
         """
+        check_finite("features", check_plain("features", features))
         flat = features.flatten(0, -2).double()
         mean, std = flat.mean(0), flat.std(0, correction=0)
         constant = (std <= 1e-6 * (1 + mean.abs())).nonzero().squeeze(-1).tolist()
@@ -106,8 +113,10 @@ def balance(features: Tensor) -> Callable[[Tensor], Tensor]:
     features (N K D), the options of a query differ by the same variance in all D directions.
 
     Raises:
-        InputError: the options do not differ in some direction at all.
+        InputError: a feature is no finite number, or the options do not differ in some direction
+            at all.
     """
+    check_finite("features", check_plain("features", features))
     gaps = (features - features.mean(1, keepdim=True)).flatten(0, 1).double()
     variances, directions = torch.linalg.eigh(gaps.mT @ gaps / len(gaps))
     if variances[0] <= 1e-10 * variances[-1]:

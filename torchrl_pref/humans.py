@@ -5,13 +5,16 @@ Shapes: B sessions, H query budget, K options per query, R possible answers, D f
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Generator, Tensor
 
 from torchrl_pref.belief import uniform_sphere
-from torchrl_pref.errors import InputError, check_positive
+from torchrl_pref.errors import InputError, check_positive, check_type
 from torchrl_pref.responses import ResponseModel
+from torchrl_pref.tensors import check_finite
 
 
 class SimulatedHuman:
@@ -27,15 +30,17 @@ class SimulatedHuman:
             them all alike.
 
     Raises:
-        InputError: ``spread`` is not a finite number of at least 1.
+        InputError: there is no response model, or ``spread`` is not a number from 1 to 10⁶.
     """
 
     def __init__(self, response_model: ResponseModel, spread: float = 1.0) -> None:
+        check_type("response_model", response_model, ResponseModel, "Boltzmann(2.0)")
         self.response_model = response_model
         self.spread = check_positive("tau_spread", spread)
-        if spread < 1:
+        if not 1 <= spread <= 1e6:
             raise InputError(
-                f"tau_spread={spread}: expected a factor of at least 1; 1 is no spread"
+                f"tau_spread={spread}: expected a factor of at least 1, and at most 1e6; 1 is no "
+                "spread"
             )
 
     def draw(
@@ -50,7 +55,9 @@ class SimulatedHuman:
         human = {"omega": omega, "noise": noise, "care": self.spread**exponent}
         return TensorDict(human, [n_sessions], device=generator.device)
 
-    def respond(self, queries: Tensor, human: TensorDictBase, turn: Tensor) -> Tensor:
+    def respond(
+        self, queries: Tensor, human: TensorDictBase | Mapping[str, Tensor], turn: Tensor
+    ) -> Tensor:
         """Pick one option of a query, by the Gumbel-max trick.
 
         Args:
@@ -60,7 +67,11 @@ class SimulatedHuman:
 
         Returns:
             (B) int64, the index of the chosen option.
+
+        Raises:
+            InputError: the returns are not finite.
         """
         returns = (queries @ human["omega"].unsqueeze(-1)).squeeze(-1) * human["care"]
+        check_finite("the human's returns (queries @ omega * care)", returns)
         noise = torch.take_along_dim(human["noise"], turn[:, None, None], 1).squeeze(1)
         return (self.response_model(returns) + noise).argmax(-1)

@@ -10,6 +10,8 @@ Its *forecast* is what asking a query is expected to add, before the answer is k
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any, TypeAlias
 
 import torch
 from tensordict import TensorDictBase
@@ -24,12 +26,14 @@ from torchrl_pref.acquisition import (
 from torchrl_pref.errors import check_choice
 from torchrl_pref.responses import ResponseModel
 
+Session: TypeAlias = TensorDictBase | Mapping[str, Any]
+
 
 class Objective(ABC):
     """A quantity of a session that a policy is to raise."""
 
     @abstractmethod
-    def potential(self, session: TensorDictBase) -> Tensor:
+    def potential(self, session: Session) -> Tensor:
         """What there is of it in a session, (B 1)."""
 
     @abstractmethod
@@ -42,9 +46,9 @@ class Objective(ABC):
 class InformationGain(Objective):
     """The paper's: the sum of the information gains of the asked queries, in bits (section 3.3)."""
 
-    def potential(self, session: TensorDictBase) -> Tensor:
+    def potential(self, session: Session) -> Tensor:
         """See :meth:`Objective.potential`."""
-        return session["metrics", "information"]
+        return session["metrics"]["information"]
 
     def forecast(
         self, session: TensorDictBase, queries: Tensor, response_model: ResponseModel
@@ -60,9 +64,9 @@ class Alignment(Objective):
     its expectation without the noise of the one hidden ω.
     """
 
-    def potential(self, session: TensorDictBase) -> Tensor:
+    def potential(self, session: Session) -> Tensor:
         """See :meth:`Objective.potential`."""
-        return session["samples"].mean(1).square().sum(-1, keepdim=True)
+        return session["mean"].square().sum(-1, keepdim=True)
 
     def forecast(
         self, session: TensorDictBase, queries: Tensor, response_model: ResponseModel
@@ -74,9 +78,9 @@ class Alignment(Objective):
 class TrueAlignment(Objective):
     """The paper's alignment with the simulated human's own ω, which only a simulator knows."""
 
-    def potential(self, session: TensorDictBase) -> Tensor:
+    def potential(self, session: Session) -> Tensor:
         """See :meth:`Objective.potential`."""
-        return session["metrics", "alignment"]
+        return session["metrics"]["alignment"]
 
     def forecast(
         self, session: TensorDictBase, queries: Tensor, response_model: ResponseModel
@@ -97,7 +101,7 @@ class Entropy(Objective):
     no shape of the belief: on the sphere, D-1 bits for every halving of the distances.
     """
 
-    def potential(self, session: TensorDictBase) -> Tensor:
+    def potential(self, session: Session) -> Tensor:
         """See :meth:`Objective.potential`."""
         samples = session["samples"]
         nearest = (

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from tensordict.nn import (
@@ -12,12 +12,13 @@ from tensordict.nn import (
     TensorDictModuleBase,
     TensorDictSequential,
 )
-from torch import nn
+from torch import Tensor, nn
 from torchrl.modules import MLP, MaskedCategorical, ProbabilisticActor, ValueOperator
 
 from torchrl_pref.attention import TOKENS, AttentionScorer, OfferAttention
 from torchrl_pref.envs import FeedEnv, QueryEnv
 from torchrl_pref.errors import InputError, check_choice
+from torchrl_pref.per_belief import PerBelief
 from torchrl_pref.scorer import (
     N_BELIEF,
     BeliefFeatures,
@@ -25,6 +26,7 @@ from torchrl_pref.scorer import (
     OfferFeatures,
     OfferScorer,
     QueryScorer,
+    belief_summary,
     greedy_feature,
 )
 
@@ -34,7 +36,8 @@ class Policy:
     """An actor-critic pair that fits one environment.
 
     Attributes:
-        observe: what the networks read, computed once per step and stored with the data, or None.
+        observe: what the networks read and no session holds, computed once a step and stored with
+            the data; None where they read the session itself.
         actor: from what ``observe`` wrote to ``action``; the A2C loss calls it again.
         critic: from the session to ``state_value``.
     """
@@ -42,6 +45,12 @@ class Policy:
     observe: TensorDictModuleBase | None
     actor: ProbabilisticTensorDictSequential
     critic: TensorDictModuleBase
+
+    @property
+    def value(self) -> TensorDictModuleBase:
+        """The critic's network alone: from what ``observe`` wrote to ``state_value``."""
+        last: TensorDictModuleBase = self.critic
+        return last.module[-1] if isinstance(last, TensorDictSequential) else last
 
     @property
     def strategy(self) -> TensorDictModuleBase:
@@ -92,8 +101,8 @@ def scorer_policy(env: QueryEnv | FeedEnv, start: str | None = None) -> Policy:
     logits = TensorDictModule(
         network, in_keys=[*features.out_keys, "belief_features"], out_keys=["logits"]
     )
-    belief_features, critic = _belief_critic(n_shares, device)
-    return Policy(TensorDictSequential(features, belief_features), _actor(logits, env), critic)
+    observe = TensorDictSequential(features, _belief_features(PerBelief(belief_summary)))
+    return Policy(observe, _actor(logits, env), _belief_critic(n_shares, device))
 
 
 def attention_policy(env: QueryEnv | FeedEnv, tokens: str = "samples") -> Policy:
@@ -114,20 +123,25 @@ def attention_policy(env: QueryEnv | FeedEnv, tokens: str = "samples") -> Policy
     )
     network = kind(env.features.shape[-1], n_shares, tokens, device)
     logits = TensorDictModule(network, in_keys=["samples", shown, "remaining"], out_keys=["logits"])
-    _, critic = _belief_critic(n_shares, device)
-    return Policy(None, _actor(logits, env), critic)
+    observe = _belief_features(PerBelief(belief_summary))
+    return Policy(observe, _actor(logits, env), _belief_critic(n_shares, device))
 
 
-def _belief_critic(n_shares: int, device: torch.device) -> tuple[TensorDictModule, Any]:
-    """What the critic reads of the belief, and the critic on top of it."""
-    belief_features = TensorDictModule(
-        BeliefFeatures(), in_keys=["samples", "remaining"], out_keys=["belief_features"]
+def _belief_features(summary: Callable[[Tensor], Tensor]) -> TensorDictModule:
+    """What the critic reads of the belief."""
+    return TensorDictModule(
+        BeliefFeatures(summary), in_keys=["samples", "remaining"], out_keys=["belief_features"]
     )
+
+
+def _belief_critic(n_shares: int, device: torch.device) -> TensorDictSequential:
+    """The critic, from the session on: its own features remember nothing, so that it can be called
+    on any batch and under ``torch.vmap``, as TorchRL's advantages do."""
     value = ValueOperator(
         MLP(N_BELIEF + n_shares, 1, num_cells=[32, 32], activation_class=nn.Tanh, device=device),
         in_keys=["belief_features"],
     )
-    return belief_features, TensorDictSequential(belief_features, value)
+    return TensorDictSequential(_belief_features(belief_summary), value)
 
 
 def paper_policy(env: QueryEnv | FeedEnv) -> Policy:

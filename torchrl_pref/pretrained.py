@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from torchrl_pref.checkpoint import FILE_NAME, Checkpoint
+from torchrl_pref.checkpoint import Checkpoint
 from torchrl_pref.envs import FeedEnv, QueryEnv
 from torchrl_pref.errors import InputError, check_choice, check_count
 from torchrl_pref.experiment import load_policy
 from torchrl_pref.policies import Policy
+from torchrl_pref.runs import CHECKPOINT
 
 FOLDER = Path(__file__).parent / "pretrained"
 
@@ -68,10 +69,10 @@ def export(sweep: str | Path) -> list[Path]:
         The files that were written.
     """
     written = []
-    for path in sorted(Path(sweep).rglob(FILE_NAME)):
+    for path in sorted(Path(sweep).rglob(CHECKPOINT)):
         checkpoint = Checkpoint.load(path)
         settings = checkpoint.settings
-        checkpoint.training = {"history": checkpoint.history}
+        checkpoint.training = checkpoint.progress.state_dict()
         name = f"{settings['setup']['name']}-{settings['tau']}-{settings['seed']}.pt"
         checkpoint.save(FOLDER / name)
         written.append(FOLDER / name)

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torchrl_pref.errors import InputError, check_count
 from torchrl_pref.features import check_features, corner_distances
+from torchrl_pref.files import DTYPES, is_dense, load_safely, without_rest
 from torchrl_pref.gridworld import random_walks
 from torchrl_pref.writing import replacing
 
@@ -25,12 +26,12 @@ class QueryPool:
     """A fixed set of queries to choose from.
 
     Attributes:
-        features: (N K D) float32.
+        features: (N K D) float32; a copy of what was given, without its gradients.
         trajectories: (N K T …), what a person would be shown, or None.
 
     Raises:
         InputError: the features are not (N, K ≥ 2, D ≥ 2) finite numbers, or the trajectories do
-            not belong to them.
+            not belong to them or are of a type that cannot be saved.
     """
 
     features: Tensor
@@ -38,12 +39,27 @@ class QueryPool:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "features", check_features(self.features))
-        shown = self.trajectories
-        if shown is not None and shown.shape[:2] != self.features.shape[:2]:
+        if self.trajectories is not None:
+            object.__setattr__(self, "trajectories", self._check_trajectories(self.trajectories))
+
+    def _check_trajectories(self, shown: Any) -> Tensor:
+        """The trajectories as a plain tensor, without gradients."""
+        if not isinstance(shown, Tensor) or shown.layout != torch.strided:
+            raise InputError(
+                f"trajectories of type {type(shown).__name__}: expected a dense torch.Tensor; "
+                "torch.as_tensor(…) makes one of an array or of lists, to_dense() of a sparse one"
+            )
+        if shown.dtype not in DTYPES or shown.is_meta:
+            raise InputError(
+                f"trajectories of {shown.dtype} on {shown.device}: expected plain numbers, which "
+                "can be saved; convert them, as by .float()"
+            )
+        if shown.shape[:2] != self.features.shape[:2]:
             raise InputError(
                 f"trajectories of shape {tuple(shown.shape)}: expected "
                 f"{tuple(self.features.shape[:2])} as the first two sizes, those of the features"
             )
+        return shown.detach().as_subclass(Tensor)
 
     def __len__(self) -> int:
         return len(self.features)
@@ -70,7 +86,8 @@ class QueryPool:
 
     def save(self, path: str | Path) -> None:
         """Write the pool to a file, whole or not at all."""
-        content = {"features": self.features, "trajectories": self.trajectories}
+        shown = None if self.trajectories is None else without_rest(self.trajectories)
+        content = {"features": without_rest(self.features), "trajectories": shown}
         save_atomically({"kind": "query pool", **content}, path)
 
     @classmethod
@@ -78,13 +95,20 @@ class QueryPool:
         """Read a pool from a file. No pickled code is ever executed.
 
         Raises:
-            InputError: the file is missing, cut off, or not a query pool.
+            InputError: the file is missing, cut off, spoiled, or not a query pool.
         """
         content = load_safely(path, "query pool")
-        features = content.get("features")
-        if not isinstance(features, Tensor):
-            raise InputError(f"{path}: a query pool without features; make it again with save()")
-        return cls(features, content.get("trajectories"))
+        features: Any = content.get("features")
+        shown: Any = content.get("trajectories")
+        if not is_dense(features) or not (shown is None or is_dense(shown)):
+            raise InputError(
+                f"{path}: a query pool without features, or with what is no plain tensor; make it "
+                "again with save()"
+            )
+        try:
+            return cls(features, shown)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
 
 
 def gridworld_pool(
@@ -124,24 +148,3 @@ def save_atomically(content: dict[str, Any], path: str | Path) -> None:
         raise InputError(
             f"{path}: cannot be written ({error}); free some space there, or name another folder"
         ) from error
-
-
-def load_safely(path: str | Path, kind: str) -> dict[str, Any]:
-    """Read what :func:`save_atomically` wrote, with ``weights_only=True``.
-
-    Raises:
-        InputError: the file is missing, unreadable, or of another kind.
-    """
-    if not Path(path).is_file():
-        raise InputError(f"{path}: no such file; expected a {kind}; check the path")
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # whatever the reader trips over, the file is at fault
-        raise InputError(
-            f"{path}: cannot be read as a {kind} (cut off, or not a file of plain tensors); "
-            "expected a file written by this package; make it again or restore a copy"
-        ) from error
-    found = content.get("kind") if isinstance(content, dict) else None
-    if found != kind:
-        raise InputError(f"{path}: holds {found or 'something else'}; expected a {kind}")
-    return content

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Mapping, Sequence
-from itertools import pairwise
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -97,6 +96,22 @@ def detail_table(results: Results, style: str = "simple") -> str:
     return tabulate(rows, headers, tablefmt=style, disable_numparse=True)
 
 
+def few_samples(results: Results) -> list[str]:
+    """A line for each strategy whose belief has at times been worth under half of its samples."""
+    lines = []
+    for name, result in results.items():
+        shares = result.ess / result.ess[:, :1]  # of the prior's, which are independent
+        least = shares.amin(1)
+        if (least < 0.5).any():
+            count, worst = int((least < 0.5).sum()), result.ess[int(least.argmin())]
+            lines.append(
+                f"! {NAMES.get(name, name)}: in {count} of {len(least)} sessions the belief was "
+                f"worth under half of its samples (least: {worst.min():.0f} of {worst[0]:.0f}); "
+                "raise belief.samples, or trust these rows less"
+            )
+    return [*lines, ""] if lines else []
+
+
 def _difference(paired: Tensor) -> str:
     """Mean and interval of a paired difference."""
     return signed(float(paired.mean()), bootstrap_interval(paired))
@@ -165,90 +180,24 @@ def draw_band(axis: Axes, means: Tensor, intervals: Tensor, **line: Any) -> None
     )
 
 
-def figure_2(histories: Mapping[str, Sequence[float]], path: Path) -> None:
-    """The paper's Figure 2: mean length of the training episodes against the number of updates."""
-    figure, axis = plt.subplots(figsize=(5.6, 4))
-    for name, values in histories.items():
-        axis.plot(*smoothed(values, geometric_edges(len(values))), label=name)
-    # Most of it happens in the first hundredth of the updates.
-    axis.set(xlabel="A2C updates", ylabel="training episode length (offers)", xscale="log")
-    axis.grid(alpha=0.25)
-    axis.legend(frameon=False)
-    save_figure(figure, path)
-
-
-def training_figure(history: Mapping[str, Sequence[float]], path: Path) -> None:
-    """How training went: means over the episodes that ended (alignment, length, reward) and what
-    the critic knew of the returns, against the number of updates."""
-    names = [name for name in history if name.startswith("train/")]
-    figure, axes = plt.subplots(1, len(names), figsize=(4.2 * len(names), 3.4))
-    for axis, name in zip(axes, names, strict=True):
-        axis.plot(*smoothed(history[name], even_edges(len(history[name]))), color=STYLE["RL"][0])
-        label = name.removeprefix("train/").replace("_", " ")
-        axis.set(xlabel="A2C updates", ylabel=label)
-        axis.grid(alpha=0.25)
-    save_figure(figure, path)
-
-
-def write_report(
-    folder: Path,
-    panels: Mapping[str, Results],
-    histories: Mapping[str, Mapping[str, Sequence[float]]],
-) -> None:
+def write_report(folder: Path, panels: Mapping[str, Results]) -> None:
     """Write tables, curves and figures to a folder; print the tables of each panel and say where.
 
     Args:
         folder: an existing folder.
         panels: evaluations by strategy, by the title of the panel.
-        histories: training metrics by the name of the learned policy; may be empty.
     """
     tables = []
     for title, results in panels.items():
         n_humans = len(next(iter(results.values())).asked)
         heading = f"{title}, {n_humans} humans: alignment after so many queries"
         tables += [heading, "", alignment_table(results), ""]
-        tables += ["after the last query", "", detail_table(results), ""]
+        tables += ["after the last query", "", detail_table(results), "", *few_samples(results)]
     text = "\n".join(tables)
     write_text(folder / "tables.txt", text)
     write_curves(panels, folder / "curves.csv")
     figure_1(panels, folder / "figure_1.png")
-    written = ["tables.txt", "curves.csv", "figure_1.png"]
-    lengths = {
-        name: history["train/episode_length"]
-        for name, history in histories.items()
-        if name.startswith("RL-feed")
-    }
-    if lengths:
-        figure_2(lengths, folder / "figure_2.png")
-        written.append("figure_2.png")
-    if len(histories) == 1:
-        training_figure(next(iter(histories.values())), folder / "training.png")
-        written.append("training.png")
-    print(f"\n{text}\nwritten to {folder}: {', '.join(written)}")
-
-
-def smoothed(values: Sequence[float], edges: Sequence[int]) -> tuple[list[float], list[float]]:
-    """Means of the known values between edges (1-based updates), and the updates' middles."""
-    middles, means = [], []
-    for start, end in pairwise(edges):
-        known = [value for value in values[start - 1 : end - 1] if not math.isnan(value)]
-        if known:
-            middles.append((start + end - 1) / 2)
-            means.append(sum(known) / len(known))
-    return middles, means
-
-
-def even_edges(count: int) -> list[int]:
-    """Edges of at most 100 stretches of equal length that cover updates 1 to ``count``."""
-    return [*range(1, count + 1, math.ceil(count / 100)), count + 1]
-
-
-def geometric_edges(count: int) -> list[int]:
-    """Edges of stretches each about a tenth longer than the one before."""
-    edges = [1]
-    while edges[-1] <= count:
-        edges.append(min(count + 1, math.ceil(edges[-1] * 1.1 + 1e-9)))
-    return edges
+    print(f"\n{text}\nwritten to {folder}: tables.txt, curves.csv, figure_1.png")
 
 
 def save_figure(figure: Figure, path: Path) -> None:

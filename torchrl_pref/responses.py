@@ -19,7 +19,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from torchrl_pref.errors import InputError, check_positive
+from torchrl_pref.errors import InputError, check_not_negative, check_positive
+from torchrl_pref.tensors import check_finite, check_plain
+
+MAX_TAU = 1e30
+"""Larger and a product with a return is beyond float32; 10⁶ is an optimal user already."""
 
 
 class Prediction(NamedTuple):
@@ -55,6 +59,17 @@ class ResponseModel(ABC):
             (…), natural logarithm.
         """
         return self.log_likelihood(gaps).sum(-1)
+
+    def agrees(self, gaps: Tensor) -> Tensor:
+        """Whether the choice of an option is possible, other than as a tie of options that differ.
+
+        Args:
+            gaps: (… K-1), as in :meth:`log_likelihood`.
+
+        Returns:
+            (…) bool.
+        """
+        return self.log_likelihood(gaps) > -math.inf
 
     def __call__(self, returns: Tensor) -> Tensor:
         """Log-probability of each answer.
@@ -99,7 +114,7 @@ class Boltzmann(ResponseModel):
         tau: what the returns are multiplied by; above 0. Larger is less noisy.
 
     Raises:
-        InputError: ``tau`` is not a finite number above zero.
+        InputError: ``tau`` is not a finite number above zero, or beyond float32.
     """
 
     def __init_subclass__(cls, **_: Any) -> None:
@@ -107,6 +122,8 @@ class Boltzmann(ResponseModel):
 
     def __init__(self, tau: float) -> None:
         self.tau = check_positive("tau", tau)
+        if self.tau > MAX_TAU:
+            raise InputError(f"tau={tau!r}: expected at most {MAX_TAU:g}; use Optimal() instead")
 
     def log_likelihood(self, gaps: Tensor) -> Tensor:
         """See :meth:`ResponseModel.log_likelihood`."""
@@ -154,19 +171,26 @@ class Optimal(ResponseModel):
     Args:
         tolerance: gaps this small count as ties. It absorbs the rounding of float32 returns, so a
             belief never excludes the very human who answered. In the units of the return.
+
+    Raises:
+        InputError: ``tolerance`` is not a finite number of at least zero.
     """
 
     def __init_subclass__(cls, **_: Any) -> None:
         _refuse_subclass(cls, Optimal)
 
     def __init__(self, tolerance: float = 1e-6) -> None:
-        self.tolerance = tolerance
+        self.tolerance = check_not_negative("tolerance", tolerance)
 
     def log_likelihood(self, gaps: Tensor) -> Tensor:
         """See :meth:`ResponseModel.log_likelihood`."""
         ties = 1 + (gaps.abs() <= self.tolerance).sum(-1)
         beaten = (gaps < -self.tolerance).any(-1)
         return torch.where(beaten, -math.inf, -ties.to(gaps.dtype).log())
+
+    def agrees(self, gaps: Tensor) -> Tensor:
+        """See :meth:`ResponseModel.agrees`: two that differ are never quite equal."""
+        return (gaps > self.tolerance).all(-1)
 
     def predict(self, leads: Tensor) -> Prediction:
         """See :meth:`ResponseModel.predict`."""
@@ -178,6 +202,15 @@ class Optimal(ResponseModel):
 
     def __repr__(self) -> str:
         return "Optimal()"
+
+
+def compiled_constants(response_model: ResponseModel) -> tuple[float, float] | None:
+    """What the compiled loops know a model by: tau and tolerance; None for others than ours."""
+    if isinstance(response_model, Boltzmann):
+        return response_model.tau, 0.0
+    if isinstance(response_model, Optimal):
+        return math.inf, response_model.tolerance
+    return None
 
 
 def _refuse_subclass(cls: type, parent: type) -> None:
@@ -219,8 +252,16 @@ def calibrate_tau(returns: Tensor, target: float = 0.9) -> float:
         target: mean probability of the best option, above 1/K and below 1.
 
     Raises:
-        InputError: no tau up to 10⁶ reaches the target (most options tie).
+        InputError: the returns are no finite numbers of K ≥ 2 options, or no tau up to 10⁶ reaches
+            the target (most options tie).
     """
+    check_plain("returns", returns)
+    if returns.ndim < 1 or returns.shape[-1] < 2 or not returns.numel():
+        raise InputError(
+            f"returns of shape {tuple(returns.shape)}: expected (… K), at least one row of at "
+            "least 2 options"
+        )
+    check_finite("returns", returns.to(torch.float32))
     gaps = (returns.amax(-1, keepdim=True) - returns).sort(-1).values[..., 1:]
 
     def accuracy(tau: float) -> float:

@@ -13,6 +13,9 @@ from torchrl_pref.writing import PARTIAL
 
 LOCK = ".lock"
 
+CHECKPOINT = "checkpoint.pt"
+"""The file of a run's folder that holds its policy."""
+
 
 @contextmanager
 def claimed(folder: Path) -> Iterator[None]:

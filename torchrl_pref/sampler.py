@@ -1,12 +1,13 @@
-"""The Markov step of the belief: slice sampling on the unit sphere along great circles.
+"""The Markov moves of the belief: slice sampling on the unit sphere along great circles.
 
-Shapes: S sessions, M samples, H answers, K options per query, D features, U uniforms of a step.
+Shapes: S sessions, M samples, H answers, K options per query, D features, V moves, P groups of
+samples, U uniforms of a move.
 
 A slice sampler (Neal, 2003) restricted to a great circle through the current point (Habeck,
 Hasenpflug, Kodgirwar and Rudolf, *Geodesic slice sampling on the sphere*, 2023). It has no step
 size that must be right, and works for hard answers, whose likelihood is zero on one side.
 
-The step is here twice: in tensors, for any response model on any device, and in ``sampler_cpu.py``
+The move is here twice: in tensors, for any response model on any device, and in ``sampler_cpu.py``
 as a compiled loop, for the models of this package on the CPU. Given the same uniforms both move a
 sample to the same place, but for rounding at the very edge of a slice.
 """
@@ -14,13 +15,21 @@ sample to the same place, but for rounding at the very edge of a slice.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Generator, Tensor
 from torch.nn import functional as F
 
+from torchrl_pref.resampling import (
+    GROUPS,
+    explained_share,
+    frames_of,
+    group_of,
+    spread_of_others,
+)
+from torchrl_pref.resampling_cpu import compiled_moves
 from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel
-from torchrl_pref.sampler_cpu import compiled_step
 
 ARC = 32.0
 """Length of the arc that is searched, in standard deviations of the posterior along it. A short
@@ -31,42 +40,62 @@ MAX_SHRINKS = 16
 would have gone, so that giving up leaves the posterior invariant too."""
 
 
-def great_circle_step(
-    samples: Tensor,
-    poles: Tensor,
-    answers: Tensor,
-    slack: Tensor,
-    response_model: ResponseModel,
-    generator: Generator,
-) -> Tensor:
-    """Move every sample once, along the great circle through it and its pole.
+class Target(NamedTuple):
+    """A density on the sphere: a power of the likelihood of all answers, the last one eased."""
 
-    The posterior is left invariant if a pole does not depend on its sample. On that circle the
-    uniform measure of the sphere has density |sin ∠(ω, pole)|^(D-2): the meridians of a sphere
-    crowd at its poles.
+    answers: Tensor
+    """(S H K-1 D), feature gaps of at least one answer; zero rows are ignored."""
+    slack: Tensor
+    """(S), by how much the return gaps of the last answer are raised."""
+    power: Tensor
+    """(S), to which the likelihood is raised."""
+    response_model: ResponseModel
+    """The likelihood."""
+
+    def of(self, sessions: Tensor) -> Target:
+        """The same for some of the sessions."""
+        some = self.answers[sessions], self.slack[sessions], self.power[sessions]
+        return Target(*some, self.response_model)
+
+
+def round_of_moves(
+    start: Tensor,
+    samples: Tensor,
+    n_moves: int,
+    target: Target,
+    generator: Generator,
+) -> tuple[Tensor, Tensor]:
+    """Move every sample V times, each time along the great circle through it and a pole.
+
+    The posterior is left invariant if a pole does not depend on the samples that move towards it:
+    it is drawn from the spread of the other groups. On a circle the uniform measure of the sphere
+    has density |sin ∠(ω, pole)|^(D-2): the meridians of a sphere crowd at its poles.
 
     Args:
-        samples: (S M D), unit vectors.
-        poles: (S M D), as long as the posterior is wide in their direction, above zero.
-        answers: (S H K-1 D), feature gaps of at least one answer; zero rows are ignored.
-        slack: (S), by how much the return gaps of the last answer are raised.
-        response_model: the likelihood.
+        start: (S M D), where the samples were before any moves.
+        samples: (S M D), where they are.
+        n_moves: V.
+        target: what the moves leave invariant.
         generator: the source of randomness, on the device of the samples.
 
     Returns:
-        (S M D), unit vectors.
+        Samples (S M D), and how much of their variance ``start`` explains (S).
     """
-    size = (*samples.shape[:2], 2 + MAX_SHRINKS)
-    uniform = torch.rand(size, generator=generator, dtype=samples.dtype, device=samples.device)
-    given = samples, poles, answers, slack, uniform
-    constants = compiled_constants(response_model)
+    n_sessions, n_samples, n_features = samples.shape
+    device = samples.device
+    normal = torch.randn((n_sessions, n_moves, n_features), generator=generator, device=device)
+    size = (n_moves, n_sessions, n_samples, 2 + MAX_SHRINKS)
+    uniform = torch.rand(size, generator=generator, device=device)
+    constants = compiled_constants(target.response_model)
     if samples.is_cpu and constants is not None:
-        return compiled_step(*given, ARC, *constants)
-    return tensor_step(*given, response_model)
+        given = start, samples, normal, uniform, target.answers, target.slack, target.power
+        return compiled_moves(*given, min(GROUPS, n_samples), ARC, *constants)
+    moved = tensor_moves(samples, normal, uniform, target)
+    return moved, explained_share(start, moved)
 
 
 def compiled_constants(response_model: ResponseModel) -> tuple[float, float] | None:
-    """What ``sampler_cpu.compiled_step`` knows a model by: tau and tolerance; None for others."""
+    """What ``compiled_moves`` knows a model by: tau and tolerance; None for others."""
     if isinstance(response_model, Boltzmann):
         return response_model.tau, 0.0
     if isinstance(response_model, Optimal):
@@ -74,43 +103,53 @@ def compiled_constants(response_model: ResponseModel) -> tuple[float, float] | N
     return None
 
 
-def tensor_step(
-    samples: Tensor,
-    poles: Tensor,
-    answers: Tensor,
-    slack: Tensor,
-    uniform: Tensor,
-    response_model: ResponseModel,
-) -> Tensor:
-    """:func:`great_circle_step` in tensors, with its uniforms (S M U) in [0, 1) given.
+def tensor_moves(samples: Tensor, normal: Tensor, uniform: Tensor, target: Target) -> Tensor:
+    """:func:`round_of_moves` in tensors, with normal (S V D) and uniform (V S M U) numbers given.
+
+    Returns:
+        (S M D), unit vectors.
+    """
+    # As long as a Gaussian with this covariance is wide in the direction of the pole.
+    poles = frames_of(normal) @ spread_of_others(samples).flatten(1, 2).mT
+    poles = poles.unflatten(2, (-1, samples.shape[2]))
+    group = group_of(samples.shape[1], poles.shape[2], samples.device)
+    for v, luck in enumerate(uniform):
+        samples = _tensor_move(samples, poles[:, v, group], luck, target)
+    return samples
+
+
+def _tensor_move(samples: Tensor, poles: Tensor, uniform: Tensor, target: Target) -> Tensor:
+    """One move of samples (S M D) towards a pole each (S M D), with uniforms (S M U).
 
     Every sample goes through all shrinks, also when it has found its place, so that nothing has
     to be counted and no device is waited for.
     """
-    power = samples.shape[-1] - 2
+    meridians = samples.shape[-1] - 2
     along = (poles * samples).sum(-1, keepdim=True)
     across = poles - along * samples
     height = across.norm(dim=-1, keepdim=True).clamp(min=1e-20)
     tangents = across / height
     pole_angle = torch.atan2(height, along).squeeze(-1)
     # Samples are innermost in memory: every operation below then runs along them.
-    size = (*answers.shape[:3], samples.shape[1])
-    rows = answers.flatten(1, 2)
+    size = (*target.answers.shape[:3], samples.shape[1])
+    rows = target.answers.flatten(1, 2)
     cosine = (rows @ samples.mT).view(size).permute(1, 2, 0, 3).contiguous()
     sine = (rows @ tangents.mT).view(size).permute(1, 2, 0, 3).contiguous()
 
     def log_density(angle: Tensor) -> Tensor:
         """(S M), of the points at an angle (S M) on their circles."""
         gaps = torch.addcmul(cosine * angle.cos(), sine, angle.sin())
-        gaps[-1] += slack.unsqueeze(-1)
+        gaps[-1] += target.slack.unsqueeze(-1)
+        likelihood = target.response_model.joint_log_likelihood(gaps.permute(2, 3, 0, 1))
         meridian = (pole_angle - angle).sin().abs().clamp(min=1e-30).log()
-        return response_model.joint_log_likelihood(gaps.permute(2, 3, 0, 1)) + power * meridian
+        return target.power.unsqueeze(-1) * likelihood + meridians * meridian
 
     place, level, *fractions = uniform.unbind(-1)
     angle = torch.zeros_like(pole_angle)
     threshold = log_density(angle) + torch.log1p(-level)
     threshold = threshold.clamp(min=torch.finfo(threshold.dtype).min)  # the impossible stays below
-    arc = (ARC * poles.norm(dim=-1)).clamp(max=2 * math.pi)
+    # Of two features there is but one circle, and going round it reaches every mode.
+    arc = (ARC * poles.norm(dim=-1)).clamp(min=0 if meridians else 2 * math.pi, max=2 * math.pi)
     high = place * arc
     low = high - arc
     found = torch.zeros_like(angle, dtype=torch.bool)

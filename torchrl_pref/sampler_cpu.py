@@ -1,11 +1,14 @@
-"""The Markov step of ``sampler.py`` compiled by Numba for the CPU: one session after the other.
+"""The Markov moves of ``sampler.py`` compiled by Numba for the CPU: one session after the other.
 
 A sample that has found its place costs nothing more, a session's numbers never leave the cache, and
 a call for one session costs a hundredth of one for a hundred. Innermost loops run over samples, so
 that the processor takes several at once. The first call on a new machine takes some seconds.
 
-Shapes: S sessions, M samples, H answers, K options per query, D features, U uniforms of a step,
-G = h (K-1) return gaps of the h answers that a session has.
+A move needs of ω only its return gaps: they turn with ω, and all samples of a group move towards
+one pole, so that a move costs as much for many features as for few.
+
+Shapes: S sessions, M samples, H answers, K options per query, D features, V moves, P groups of
+samples, U uniforms of a move, G = h (K-1) return gaps of the h answers that a session has.
 """
 
 from __future__ import annotations
@@ -14,132 +17,140 @@ import math
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from torchrl_pref.compiled import compiled
 
 Array = np.ndarray[Any, np.dtype[Any]]
 
 
-def compiled_step(
-    samples: Tensor,
-    poles: Tensor,
-    answers: Tensor,
-    slack: Tensor,
-    uniform: Tensor,
-    arc: float,
-    tau: float,
-    tolerance: float,
-) -> Tensor:
-    """``sampler.great_circle_step`` with its uniforms given, for Boltzmann and optimal humans.
-
-    Args:
-        samples, poles: (S M D).
-        answers: (S H K-1 D).
-        slack: (S).
-        uniform: (S M U), in [0, 1): two, and one for each shrink.
-        arc: length of the arc that is searched, in lengths of the pole.
-        tau: what the gaps are multiplied by; infinite for answers without error.
-        tolerance: of answers without error: gaps this small are ties.
-
-    Returns:
-        (S M D), unit vectors.
-    """
-    moved = torch.empty_like(samples, memory_format=torch.contiguous_format)
-    arrays = [t.contiguous().numpy() for t in (samples, poles, answers, slack, uniform, moved)]
-    _move_sessions(*arrays, arc, tau, tolerance)
-    return moved
+@compiled
+def rows_of(answers: Array, slack: float, unit: float) -> tuple[Array, Array]:
+    """Feature gaps (G D) of the answers (H K-1 D) that there are, in units of 1/tau, and by how
+    much the return gaps are raised (G): those of the last answer by the slack."""
+    n_answers, n_others, n_features = answers.shape
+    rows = np.empty((n_answers * n_others, n_features))
+    raised = np.zeros(len(rows))
+    g = 0
+    for h in range(n_answers):
+        newest = h == n_answers - 1
+        if newest or np.any(answers[h]):
+            for k in range(n_others):
+                rows[g] = unit * answers[h, k]
+                raised[g] = unit * slack if newest else 0.0
+                g += 1
+    return rows[:g], raised[:g]
 
 
 @compiled
-def _move_sessions(
-    samples: Array,
-    poles: Array,
-    answers: Array,
-    slack: Array,
-    uniform: Array,
-    moved: Array,
-    arc: float,
-    tau: float,
-    tolerance: float,
-) -> None:
-    """Fill ``moved`` (S M D)."""
-    n_answers, n_others, n_features = answers.shape[1:]
-    hard = math.isinf(tau)
-    unit = 1.0 if hard else tau  # gaps are in units of 1/tau
-    rows = np.empty((n_features, n_answers * n_others))
-    raised = np.empty(rows.shape[1])
-    for s in range(len(samples)):
-        g = 0
-        for h in range(n_answers):
-            newest = h == n_answers - 1
-            if newest or np.any(answers[s, h]):
-                for k in range(n_others):
-                    rows[:, g] = unit * answers[s, h, k]
-                    raised[g] = unit * slack[s] if newest else 0.0
-                    g += 1
-        session = samples[s], poles[s], uniform[s], moved[s]
-        _move(*session, rows[:, :g], raised[:g], arc, n_others, hard, tolerance)
-
-
-@compiled
-def _move(
+def move_session(
     samples: Array,
     poles: Array,
     uniform: Array,
     moved: Array,
     rows: Array,
     raised: Array,
+    power: float,
     arc: float,
     n_others: int,
     hard: bool,
     tolerance: float,
 ) -> None:
-    """Fill ``moved`` (M D) with where the slice sampler takes the samples (M D) of a session."""
+    """Fill ``moved`` (M D) with where V moves take the samples (M D) of a session."""
     n_samples, n_features = samples.shape
-    tangents, pole, ends = _aim(samples, poles, uniform, arc)
-    # At an angle on a circle the gaps are circles[0] cos(angle) + circles[1] sin(angle) + raised.
-    circles = np.zeros((2, len(raised), n_samples))
-    for d in range(n_features):
-        at, ahead = samples[:, d].copy(), tangents[:, d].copy()
-        for g in range(len(raised)):
-            for m in range(n_samples):
-                circles[0, g, m] += rows[d, g] * at[m]
-                circles[1, g, m] += rows[d, g] * ahead[m]
-    turn = _search(circles, raised, pole, ends, uniform, n_features - 2, n_others, hard, tolerance)
+    places = np.empty((n_features, n_samples))
     for m in range(n_samples):
-        cosine, sine = math.cos(np.float32(turn[m])), math.sin(np.float32(turn[m]))
+        # Of unit length in float64: a circle through the pole nearby is told by the rounding else.
         norm = 0.0
         for d in range(n_features):
-            tangents[m, d] = samples[m, d] * cosine + tangents[m, d] * sine
-            norm += tangents[m, d] * tangents[m, d]
+            norm += float(samples[m, d]) ** 2
         for d in range(n_features):
-            moved[m, d] = tangents[m, d] / math.sqrt(norm)
+            places[d, m] = samples[m, d] / math.sqrt(norm)
+    gaps = np.zeros((len(raised), n_samples))
+    for g in range(len(raised)):
+        for d in range(n_features):
+            row = rows[g, d]
+            for m in range(n_samples):
+                gaps[g, m] += row * places[d, m]
+    # At an angle on a circle the gaps are circles[0] cos(angle) + circles[1] sin(angle) + raised.
+    circles = np.empty((2, len(raised), n_samples))
+    for v in range(len(poles)):
+        along, height, pole, ends = _aim(places, poles[v], uniform[v], arc)
+        circles[0] = gaps
+        _turn_gaps(gaps, circles[1], rows, poles[v], along, height)
+        given = circles, raised, pole, ends, uniform[v], power, n_features - 2
+        turn = _search(*given, n_others, hard, tolerance)
+        cosine, sine = np.cos(turn), np.sin(turn)
+        for m in range(n_samples):
+            sine[m] /= height[m]
+            cosine[m] -= along[m] * sine[m]  # of the place itself
+        for p in range(poles.shape[1]):
+            first, last = _group(p, poles.shape[1], n_samples)
+            for d in range(n_features):
+                ahead = poles[v, p, d]
+                for m in range(first, last):
+                    places[d, m] = places[d, m] * cosine[m] + ahead * sine[m]
+            for g in range(len(raised)):
+                ahead = 0.0
+                for d in range(n_features):
+                    ahead += rows[g, d] * poles[v, p, d]
+                for m in range(first, last):
+                    gaps[g, m] = gaps[g, m] * cosine[m] + ahead * sine[m]
+    for m in range(n_samples):
+        norm = 0.0
+        for d in range(n_features):
+            norm += places[d, m] * places[d, m]
+        for d in range(n_features):
+            moved[m, d] = places[d, m] / math.sqrt(norm)
 
 
 @compiled
-def _aim(samples: Array, poles: Array, uniform: Array, arc: float) -> tuple[Array, Array, Array]:
-    """Tangents (M D), cosine and sine of the angle to the pole (2 M), ends of the arc (2 M)."""
-    n_samples, n_features = samples.shape
-    tangents = np.empty((n_samples, n_features))
+def _group(p: int, n_groups: int, n_samples: int) -> tuple[int, int]:
+    """First sample of a group, and the first of the next."""
+    return -(-p * n_samples // n_groups), -(-(p + 1) * n_samples // n_groups)
+
+
+@compiled
+def _turn_gaps(
+    gaps: Array, ahead: Array, rows: Array, poles: Array, along: Array, height: Array
+) -> None:
+    """Fill ``ahead`` (G M) with the gaps of the tangents, from those of the places (G M)."""
+    n_samples = gaps.shape[1]
+    for p in range(len(poles)):
+        first, last = _group(p, len(poles), n_samples)
+        for g in range(len(gaps)):
+            of_pole = 0.0
+            for d in range(rows.shape[1]):
+                of_pole += rows[g, d] * poles[p, d]
+            for m in range(first, last):
+                ahead[g, m] = (of_pole - along[m] * gaps[g, m]) / height[m]
+
+
+@compiled
+def _aim(
+    places: Array, poles: Array, uniform: Array, arc: float
+) -> tuple[Array, Array, Array, Array]:
+    """How far the places (D M) are along their pole, the length of the rest of it (M), cosine and
+    sine of the angle to it (2 M), and the ends of the arc (2 M)."""
+    n_features, n_samples = places.shape
+    along, height = np.zeros(n_samples), np.empty(n_samples)
     pole, ends = np.empty((2, n_samples)), np.empty((2, n_samples))
-    for m in range(n_samples):
-        along = length = height = 0.0
+    for p in range(len(poles)):
+        first, last = _group(p, len(poles), n_samples)
+        square = 0.0
         for d in range(n_features):
-            along += poles[m, d] * samples[m, d]
-            length += poles[m, d] * poles[m, d]
-        for d in range(n_features):
-            tangents[m, d] = poles[m, d] - along * samples[m, d]
-            height += tangents[m, d] * tangents[m, d]
-        height, length = max(math.sqrt(height), 1e-20), math.sqrt(length)
-        for d in range(n_features):
-            tangents[m, d] /= height
-        pole[0, m], pole[1, m] = along / length, height / length
-        width = min(arc * length, 2 * math.pi)
-        ends[1, m] = uniform[m, 0] * width
-        ends[0, m] = ends[1, m] - width
-    return tangents, pole, ends
+            ahead = poles[p, d]
+            square += ahead * ahead
+            for m in range(first, last):
+                along[m] += ahead * places[d, m]
+        length = math.sqrt(square)
+        # Of two features there is but one circle, and going round it reaches every mode.
+        width = min(arc * length, 2 * math.pi) if n_features > 2 else 2 * math.pi
+        for m in range(first, last):
+            height[m] = max(math.sqrt(max(square - along[m] * along[m], 0.0)), 1e-20)
+            pole[0, m], pole[1, m] = along[m] / length, height[m] / length
+            ends[1, m] = uniform[m, 0] * width
+            ends[0, m] = ends[1, m] - width
+    return along, height, pole, ends
 
 
 @compiled
@@ -149,7 +160,8 @@ def _search(
     pole: Array,
     ends: Array,
     uniform: Array,
-    power: int,
+    power: float,
+    meridians: int,
     n_others: int,
     hard: bool,
     tolerance: float,
@@ -159,8 +171,8 @@ def _search(
     turn, angle, cosine, sine = np.zeros(n), np.empty(n), np.ones(n), np.zeros(n)
     level = _surprise(circles, raised, cosine, sine, n_others, hard, tolerance)
     for m in range(n):
-        level[m] -= power * _log(abs(pole[1, m])) + _log(1.0 - uniform[m, 1])
-        level[m] = min(level[m], 1e300)  # the impossible stays above
+        level[m] = power * level[m] - meridians * _log(abs(pole[1, m]))
+        level[m] = min(level[m] - _log(1.0 - uniform[m, 1]), 1e300)  # the impossible stays above
     left, refused = np.arange(n), np.empty(n, np.int64)
     for i in range(2, uniform.shape[1]):
         for j in range(n):
@@ -172,7 +184,7 @@ def _search(
         for j in range(n_tried):
             m = left[j]
             meridian = abs(pole[1, m] * cosine[j] - pole[0, m] * sine[j])
-            if surprise[j] <= level[m] + power * _log(meridian):
+            if power * surprise[j] <= level[m] + meridians * _log(meridian):
                 turn[m] = angle[j]
             else:
                 ends[int(angle[j] > 0), m] = angle[j]

@@ -7,6 +7,7 @@ F features of a candidate, G features of the belief.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
@@ -20,10 +21,11 @@ from torchrl_pref.acquisition import (
     together,
     volume_removal,
 )
-from torchrl_pref.belief import covariance_of
 from torchrl_pref.envs import FeedEnv
 from torchrl_pref.errors import check_choice
 from torchrl_pref.objectives import OBJECTIVES
+from torchrl_pref.per_belief import PerBelief
+from torchrl_pref.resampling import covariance_of
 from torchrl_pref.responses import ResponseModel
 from torchrl_pref.strategies import OfferRank, asks_over_offers
 
@@ -54,10 +56,12 @@ class CandidateFeatures(nn.Module):
     def __init__(self, response_model: ResponseModel) -> None:
         super().__init__()
         self.response_model = response_model
+        self.moments = PerBelief(_moments)
 
     def forward(self, samples: Tensor, queries: Tensor) -> Tensor:
         """From samples (B M D) and candidates (B C K D) to features (B C F)."""
-        mean = samples.mean(1)
+        moments = self.moments(samples)
+        mean, covariance = moments[:, 0], moments[:, 1:]
         gain, alignment, removal = score_queries(
             samples,
             queries,
@@ -65,7 +69,6 @@ class CandidateFeatures(nn.Module):
             together(information_gain, alignment_gain, volume_removal),
         ).unbind(-1)
         centred = queries - queries.mean(-2, keepdim=True)
-        covariance = covariance_of(samples)
         variance = ((centred @ covariance.unsqueeze(1)) * centred).sum((-2, -1))
         apart = (centred @ mean[:, None, :, None]).squeeze(-1).norm(dim=-1)
         length = centred.square().sum((-2, -1)).sqrt()
@@ -87,15 +90,19 @@ def greedy_feature(objective: str) -> int:
 
 class BeliefFeatures(nn.Module):
     """How far the session is and how sure the belief: the shares of asks (and offers) left, the
-    length of the mean, and the log of the largest, mean and smallest variance of the samples."""
+    length of the mean, and the log of the largest, mean and smallest variance of the samples.
+
+    Args:
+        summary: :func:`belief_summary`, or what remembers it.
+    """
+
+    def __init__(self, summary: Callable[[Tensor], Tensor]) -> None:
+        super().__init__()
+        self.summary = summary
 
     def forward(self, samples: Tensor, remaining: Tensor) -> Tensor:
         """From samples (B M D) and shares (B 1 or 2) to features (B G)."""
-        # Far below any spread of samples on the sphere, far above the rounding of float32.
-        variances = torch.linalg.eigvalsh(covariance_of(samples)).clamp(min=1e-8)
-        summary = [variances[..., -1], variances.mean(-1), variances[..., 0]]
-        logs = torch.stack(summary, -1).log() / 4
-        return torch.cat([remaining, samples.mean(-2).norm(dim=-1, keepdim=True), logs], -1)
+        return torch.cat([remaining, self.summary(samples)], -1)
 
 
 class QueryScorer(nn.Module):
@@ -166,6 +173,7 @@ class OfferFeatures(nn.Module):
         self.features = CandidateFeatures(env.belief.response_model)
         self.budget, self.n_offers = env.budget, env.n_offers
         self.rank = OfferRank(env, information_gain, late=alignment_gain)
+        self.unsure = PerBelief(_unsure)
 
     def forward(
         self, samples: Tensor, offer: Tensor, n_asked: Tensor, n_offered: Tensor
@@ -177,12 +185,30 @@ class OfferFeatures(nn.Module):
         rank = self.rank(samples, offer, 1 - n_asked / self.budget)
         share = asks_over_offers(n_asked, n_offered, self.budget, self.n_offers)
         later = (0.5 + 0.5 * self.budget / (n_asked + 1)).clamp(min=1)
-        misaligned = 1 - samples.mean(1).square().sum(-1, keepdim=True)
-        # Plus one: a log that is never above 0 could only lower the share, not raise it. The floor
-        # bounds what a belief that is all but certain can ask of the patience.
-        unsure = misaligned.clamp(min=1e-3).log() + 1
-        urgency = torch.cat([later.log(), unsure], -1)
+        urgency = torch.cat([later.log(), self.unsure(samples)], -1)
         return self.features(samples, offer.unsqueeze(1)).squeeze(1), rank, share, urgency
+
+
+def _moments(samples: Tensor) -> Tensor:
+    """Mean, and below it covariance (B 1+D D), of samples (B M D)."""
+    return torch.cat([samples.mean(1, keepdim=True), covariance_of(samples)], 1)
+
+
+def belief_summary(samples: Tensor) -> Tensor:
+    """Length of the mean and logs of variances (B 4) of samples (B M D)."""
+    # Far below any spread of samples on the sphere, far above the rounding of float32.
+    variances = torch.linalg.eigvalsh(covariance_of(samples)).clamp(min=1e-8)
+    spread = [variances[..., -1], variances.mean(-1), variances[..., 0]]
+    length = samples.mean(-2).norm(dim=-1, keepdim=True)
+    return torch.cat([length, torch.stack(spread, -1).log() / 4], -1)
+
+
+def _unsure(samples: Tensor) -> Tensor:
+    """One plus the log of the misalignment (B 1) that a belief (B M D) expects."""
+    misaligned = 1 - samples.mean(1).square().sum(-1, keepdim=True)
+    # Plus one: a log that is never above 0 could only lower the share, not raise it. The floor
+    # bounds what a belief that is all but certain can ask of the patience.
+    return misaligned.clamp(min=1e-3).log() + 1
 
 
 def _zero_headed_mlp(n_inputs: int, device: torch.device) -> MLP:

@@ -18,13 +18,14 @@ from torch import Generator, Tensor
 from torchrl_pref.acquisition import (
     Acquisition,
     information_gain,
+    moments_among,
     predict_answers,
     score_queries,
-    standardise,
     together,
 )
 from torchrl_pref.envs import FeedEnv
 from torchrl_pref.errors import check_count, check_share
+from torchrl_pref.per_belief import PerBelief
 from torchrl_pref.responses import ResponseModel
 
 REFERENCE = 500
@@ -233,7 +234,8 @@ class OfferRank:
         self.acquisition, self.n_scores = together(*both), len(both)
         places = torch.linspace(0, len(env.features) - 1, min(REFERENCE, len(env.features)))
         self.reference = env.features[places.long().to(env.features.device)]
-        self._samples, self._scores = torch.empty(0), torch.empty(0)
+        self.sizes = [len(self.reference), 1, 1]
+        self._reference = PerBelief(self._score_reference)
 
     def __call__(self, samples: Tensor, offer: Tensor, left: Tensor) -> Tensor:
         """The share of the sample that the offer scores above, and half a step beyond, so that no
@@ -247,25 +249,20 @@ class OfferRank:
         Returns:
             (B 1), from 1/2N to 1 + 1/2N for a sample of N.
         """
-        scores = self._score_reference(samples)
-        score = self._score(samples, offer.unsqueeze(1))
-        weights = torch.stack([left, 1 - left], -1) if self.n_scores == 2 else left.new_ones(1)
-        value = (weights * standardise(score, scores)).sum(-1)
+        standard, mean, deviation = self._reference(samples).split_with_sizes(self.sizes, -1)
+        score = (self._score(samples, offer.unsqueeze(1)).mT - mean) / deviation
+        weights = torch.stack([left, 1 - left], 1) if self.n_scores == 2 else left.new_ones(1, 1, 1)
+        value = (weights * score).sum(1)
         # A thousandth of a standard deviation keeps a query from outranking itself by rounding.
-        above = value > (weights * standardise(scores)).sum(-1) + 1e-3
+        above = value > (weights * standard).sum(1) + 1e-3
         return (above.sum(1, keepdim=True) + 0.5) / len(self.reference)
 
     def _score_reference(self, samples: Tensor) -> Tensor:
-        """The sample's scores (B N V), made anew for the sessions whose belief is another."""
-        if self._samples.shape != samples.shape or self._samples.device != samples.device:
-            self._samples = torch.full_like(samples, torch.nan)
-            self._scores = samples.new_empty(len(samples), len(self.reference), self.n_scores)
-        changed = (self._samples != samples).flatten(1).any(1)
-        if changed.any():
-            reference = self.reference.expand(int(changed.sum()), *self.reference.shape)
-            self._scores[changed] = self._score(samples[changed], reference)
-            self._samples[changed] = samples[changed]
-        return self._scores
+        """The standardised scores of the sample (B V N), and after them mean and deviation."""
+        reference = self.reference.expand(len(samples), *self.reference.shape)
+        scores = self._score(samples, reference)
+        moments = torch.cat(moments_among(scores), 1)
+        return torch.cat([(scores - moments[:, :1]) / moments[:, 1:], moments], 1).mT.contiguous()
 
     def _score(self, samples: Tensor, queries: Tensor) -> Tensor:
         return score_queries(samples, queries, self.response_model, self.acquisition)

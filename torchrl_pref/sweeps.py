@@ -14,14 +14,13 @@ import sys
 import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
-
-from tabulate import tabulate
+from typing import TYPE_CHECKING, Any
 
 from torchrl_pref.errors import InputError, one_line
-from torchrl_pref.evaluation import Evaluation
-from torchrl_pref.reports import milestones
 from torchrl_pref.writing import replacing, write_text
+
+if TYPE_CHECKING:
+    from torchrl_pref.evaluation import Evaluation
 
 SUMMARY, FAILED, TABLE = "summary.json", "failed.json", "summary.csv"
 
@@ -34,6 +33,8 @@ def write_summary(folder: Path, overrides: Sequence[str], result: Evaluation) ->
     Returns:
         :func:`final_alignment`.
     """
+    from torchrl_pref.reports import milestones
+
     numbers = {
         f"alignment after {j}": round(float(result.alignment[:, j].mean()), 4)
         for j in milestones(result.alignment.shape[1] - 1)
@@ -96,6 +97,8 @@ def write_table(sweep: Path) -> list[Row]:
 
 def show_table(sweep: Path, rows: Sequence[Row]) -> None:
     """Print the rows of a sweep."""
+    from tabulate import tabulate
+
     widths = [60 if name == "failed" else None for name in rows[0]] if rows else None
     table = tabulate(rows, headers="keys", maxcolwidths=widths)
     print(f"\nsweep so far, {sweep / TABLE}\n{table}")

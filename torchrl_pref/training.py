@@ -1,4 +1,4 @@
-"""Advantage actor-critic (A2C) on either environment, with TorchRL's collector, GAE and loss.
+"""Advantage actor-critic (A2C) on either environment, with TorchRL's GAE and loss.
 
 Shapes: B sessions side by side, T steps of each in a batch.
 """
@@ -10,38 +10,43 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
-from torchrl.collectors import Collector
-from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
 from torchrl.objectives import A2CLoss
 from torchrl.objectives.value import GAE
-from torchrl.record.loggers import Logger, get_logger
+from torchrl.record.loggers import get_logger
 from tqdm import tqdm
 
+from torchrl_pref.collection import Sessions
 from torchrl_pref.envs import FeedEnv, QueryEnv
-from torchrl_pref.errors import check_choice, check_count, check_positive, check_share
+from torchrl_pref.errors import (
+    check_choice,
+    check_count,
+    check_positive,
+    check_share,
+)
 from torchrl_pref.policies import Policy
-from torchrl_pref.writing import write_text
+from torchrl_pref.progress import Progress, add_row, start_table
+from torchrl_pref.restore import (
+    restore_generator,
+    restore_optimizer,
+    restore_sessions,
+    restore_weights,
+)
 
-LOGGERS = ("csv", "tensorboard")
-
-METRICS = {
+OF_EPISODES = {
     "train/alignment": ("metrics", "alignment"),
     "train/episode_length": "step_count",
     "train/reward": "episode_reward",
 }
 """What is averaged over the episodes that end in a batch, by the key that holds it."""
-
-OF_BATCH = ("train/explained_variance", "time/frames_per_second")
-"""What is told of the batch as a whole."""
 
 
 @dataclass(frozen=True)
@@ -101,21 +106,6 @@ class A2CSettings:
         check_choice("training.optimizer", self.optimizer, ("adam", "rmsprop"))
 
 
-@dataclass
-class Progress:
-    """How far a training run has come.
-
-    Attributes:
-        update: updates done.
-        history: one value an update for each metric, NaN where no episode ended.
-    """
-
-    update: int = 0
-    history: dict[str, list[float]] = field(
-        default_factory=lambda: {name: [] for name in (*METRICS, *OF_BATCH)}
-    )
-
-
 class Trainer:
     """The state of a training run, and the loop.
 
@@ -136,12 +126,12 @@ class Trainer:
         self.advantage = GAE(
             gamma=settings.gamma,
             lmbda=settings.lmbda,
-            value_network=policy.critic,
+            value_network=None,  # the values come with the batch
             vectorized=False,
         )
         self.loss = A2CLoss(
             actor_network=policy.actor,
-            critic_network=policy.critic,
+            critic_network=policy.value,
             entropy_coeff=settings.entropy,
             critic_coeff=settings.critic,
             loss_critic_type="l2",
@@ -153,36 +143,35 @@ class Trainer:
             self.optimizer = torch.optim.RMSprop(
                 self.loss.parameters(), settings.learning_rate, alpha=0.99, eps=1e-5
             )
-        steps = settings.steps or env.max_steps
-        transforms = Compose(RewardSum(), StepCounter())
-        self.collector = Collector(
-            TransformedEnv(env, transforms),
-            policy.strategy,
-            frames_per_batch=settings.sessions * steps,
-            total_frames=-1,
-            track_traj_ids=False,
-            auto_register_policy_transforms=False,
-        )
+        self.frames = settings.sessions * (settings.steps or env.max_steps)
+        self.sessions = Sessions(env, policy, settings.steps or env.max_steps)
 
-    def run(self, folder: Path, save: Callable[[], None]) -> None:
+    def run(
+        self, folder: Path, save: Callable[[], None], measure: Callable[[], None] = lambda: None
+    ) -> None:
         """Train until the last update. Ctrl-C and SIGTERM take effect once the update that they
         came in is done and saved.
 
         Args:
             folder: where the logs go.
             save: called every ``save_every`` updates, at the end and before a stop.
+            measure: called at the start and after each update; it may add to the progress what the
+                policy does elsewhere, and must leave the training as it is.
 
         Raises:
             KeyboardInterrupt: at Ctrl-C; at SIGTERM whatever the process does then.
         """
         settings, progress = self.settings, self.progress
-        loggers = [_open_logger(kind, folder, progress.update) for kind in LOGGERS]
+        table = folder / "training.csv"
+        logger = get_logger("tensorboard", logger_name=str(folder), experiment_name="tensorboard")
+        assert logger is not None
         bar = tqdm(total=settings.updates, initial=progress.update, desc="training", unit="update")
         with bar, _stop_request() as stopped:
-            batches = iter(self.collector)
+            measure()
+            start_table(table, progress, self.frames)
             while progress.update < settings.updates and not stopped():
                 start = time.perf_counter()
-                batch = next(batches)
+                batch = self.sessions.collect()
                 self.update(batch)
                 progress.update += 1
                 metrics = _episode_metrics(batch)
@@ -191,8 +180,9 @@ class Trainer:
                 for name, value in metrics.items():
                     progress.history[name].append(value)
                     if not math.isnan(value):
-                        for logger in loggers:
-                            logger.log_scalar(name, value, step=progress.update)
+                        logger.log_scalar(name, value, step=progress.update)
+                measure()
+                add_row(table, progress, self.frames)
                 bar.update()
                 bar.set_postfix(_latest(progress.history), refresh=False)
                 if progress.update % settings.save_every == 0:
@@ -218,7 +208,7 @@ class Trainer:
     def _fit_critic(self, flat: TensorDictBase) -> None:
         """Bring the critic nearer to the returns of a batch (BT), in one pass over it."""
         if self.settings.critic_steps:
-            shown = flat.select(*self.policy.critic.in_keys, "value_target")
+            shown = flat.select(*self.policy.value.in_keys, "value_target")
             for part in torch.randperm(len(shown)).chunk(self.settings.critic_steps):
                 self._descend(self.loss.loss_critic(shown[part])[0].mean())
 
@@ -236,33 +226,38 @@ class Trainer:
 
     def state_dict(self) -> dict[str, Any]:
         """Plain data and tensors that :meth:`load_state_dict` goes on from, bit for bit."""
-        # TorchRL's collector state holds no environment state; ours is all in its carrier.
         return {
-            "update": self.progress.update,
+            **self.progress.state_dict(),
             "weights": self.policy.weights.state_dict(),
-            "history": self.progress.history,
             "optimizer": self.optimizer.state_dict(),
-            "sessions": self.collector._carrier.to_dict(),
+            "sessions": self.sessions.state_dict(),
             "env_generator": self.env.generator.get_state(),
             "global_generator": torch.get_rng_state(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on where :meth:`state_dict` was taken; the average is what the policy holds now."""
+        """Go on where :meth:`state_dict` was taken; the average is what the policy holds now.
+
+        Raises:
+            InputError: the state was taken of another run.
+        """
         self.start_average()
-        self.policy.weights.load_state_dict(state["weights"])
-        self.progress = Progress(state["update"], state["history"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        sessions = TensorDict(state["sessions"], self.env.batch_size, device=self.env.device)
-        self.collector._carrier.update(sessions)
-        self.env.generator.set_state(state["env_generator"])
-        torch.set_rng_state(state["global_generator"])
+        restore_weights(self.policy.weights, state["weights"])
+        self.progress = Progress.of(state)
+        restore_optimizer(self.optimizer, state["optimizer"]["state"])
+        now = self.sessions.now
+        session = now.select(*self.env.state_spec.keys())
+        restore_sessions(now, state["sessions"], session, len(self.env.features))
+        restore_generator(self.env.generator, state["env_generator"])
+        restore_generator(torch.default_generator, state["global_generator"])
 
 
 def _episode_metrics(batch: TensorDictBase) -> dict[str, float]:
     """Means over the episodes that ended in a batch; NaN where none did."""
     done = batch["next", "done"]
-    return {name: batch["next", key][done].float().mean().item() for name, key in METRICS.items()}
+    return {
+        name: batch["next", key][done].float().mean().item() for name, key in OF_EPISODES.items()
+    }
 
 
 def _explained_variance(batch: TensorDictBase) -> float:
@@ -281,16 +276,6 @@ def _latest(history: dict[str, list[float]]) -> dict[str, str]:
         number = next(known, None)
         latest[name.split("/")[-1]] = "-" if number is None else f"{number:.3g}"
     return latest
-
-
-def _open_logger(kind: str, folder: Path, update: int) -> Logger:
-    """A TorchRL logger; CSV rows that a resumed run will write again are dropped first."""
-    for path in (folder / "csv" / "scalars").rglob("*.csv") if kind == "csv" else ():
-        rows = path.read_text().splitlines(keepends=True)
-        write_text(path, "".join(row for row in rows if int(row.split(",")[0]) <= update))
-    logger = get_logger(kind, logger_name=str(folder), experiment_name=kind)
-    assert logger is not None
-    return logger
 
 
 @contextmanager

@@ -1,0 +1,83 @@
+"""The belief as features become many: effective size and time after each of 100 greedy questions.
+
+``python benchmarks/dimension.py [--features 2,4,8,16,32] [--questions 100]``. Many beliefs follow
+one human with isotropic features, who is asked the question of highest information gain of 1000
+drawn anew each time. The effective size is measured, as the variance of the samples over that of
+their mean between beliefs, and told beside what the belief reports of itself.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+sys.path[0] = str(Path(__file__).resolve().parents[1])  # this folder's select.py hides Python's
+
+import time
+
+import torch
+from torch import Generator
+from tqdm import tqdm
+
+from benchmarks import common
+from torchrl_pref.acquisition import information_gain, score_queries
+from torchrl_pref.belief import Belief, feature_gaps, uniform_sphere
+from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel
+
+BELIEFS = 100
+
+
+def main() -> None:
+    """Print the table."""
+    parser = common.arguments(__doc__)
+    parser.add_argument("--features", default="2,4,8,16,32", help="numbers of features D")
+    parser.add_argument("--questions", type=int, default=100)
+    options = common.start(parser)
+    rows = []
+    for size in map(int, options.features.split(",")):
+        for model in (Boltzmann(common.TAU), Optimal()):
+            rows.append(follow(size, model, options.questions))
+    common.report("Effective size of 100 samples, greedy questions", rows, options.json)
+
+
+def follow(n_features: int, model: ResponseModel, questions: int) -> common.Row:
+    """One human's answers, many beliefs."""
+    generator, belief = Generator().manual_seed(0), Belief(model)
+    omega = uniform_sphere((n_features,), generator)
+    samples = belief.prior(BELIEFS, n_features, generator)
+    ess = torch.full((BELIEFS,), 100.0)
+    gaps = torch.zeros(BELIEFS, 0, 1, n_features)
+    measured, reported, seconds = [], [], 0.0
+    for _ in tqdm(range(questions), desc=f"D={n_features}, {model}", unit="question"):
+        pool = torch.randn(1000, 2, n_features, generator=generator)
+        values = score_queries(samples[:1], pool[None], model, information_gain)
+        query = pool[int(values.argmax())]
+        answer = model(query @ omega).exp().multinomial(1, generator=generator)
+        newest = feature_gaps(query[None], answer).expand(BELIEFS, -1, -1)
+        start = time.process_time()
+        samples, ess, _ = belief.update(samples, ess, gaps, newest, generator)
+        seconds += time.process_time() - start
+        gaps = torch.cat([gaps, newest.unsqueeze(1)], 1)
+        variance = samples.double().flatten(0, 1).var(0).sum()
+        measured.append(float(variance / samples.double().mean(1).var(0).sum()))
+        reported.append(float(1 / (1 / ess).mean()))
+    return {
+        "D": n_features,
+        "human": "soft" if isinstance(model, Boltzmann) else "hard",
+        "questions": questions,
+        "least ESS": round(min(measured)),
+        "mean ESS": round(sum(measured) / len(measured)),
+        "least reported": round(min(reported)),
+        "mean reported": round(sum(reported) / len(reported)),
+        "reported over measured, largest": max(
+            told / true for told, true in zip(reported, measured, strict=True) if true < 95
+        )
+        if min(measured) < 95
+        else 1.0,
+        "ms an update": 1000 * seconds / questions / BELIEFS,
+        "alignment": float((samples @ omega).mean()),
+    }
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,217 @@
+"""The belief against an independent reference, over features, options, noise and odd histories.
+
+``python benchmarks/posterior.py [--sessions 200] [--features 2,4,6,8,16] [--csv FILE]``. In each
+case many beliefs get the same answers, and their samples are held against the posterior by
+importance sampling or by a walk (``tests/posterior.py``, which shares no code with the package).
+*Bias* is the distance of the mean over all samples from the posterior mean, in posterior standard
+deviations; *variance* is that of all samples about the posterior mean over that of the posterior.
+Cases beyond a bound (.02 either way) get four times the sessions, as chance can put one there.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+sys.path[0] = str(Path(__file__).resolve().parents[1])  # this folder's select.py hides Python's
+
+import csv
+import math
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from itertools import product
+from multiprocessing import get_context
+from typing import NamedTuple
+
+import torch
+from torch import Generator, Tensor
+from tqdm import tqdm
+
+from benchmarks import common
+from tests.posterior import Posterior, posterior
+from torchrl_pref.acquisition import information_gain, score_queries
+from torchrl_pref.belief import Belief, feature_gaps, uniform_sphere
+from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel
+
+BOUND = 0.02
+
+KINDS = (
+    "random",
+    "greedy",
+    "surprising",
+    "contradictory",
+    "60 answers",
+    "gaps of 1e-4",
+    "gaps of 1e3",
+    "collinear",
+)
+"""Of histories: questions and answers drawn as a human would give them; questions of highest
+information gain; each answer the least likely one; one question asked again and answered otherwise;
+many answers; tiny and huge features; features that nearly follow from each other."""
+
+
+class Case(NamedTuple):
+    """What a belief is asked to get right."""
+
+    features: int
+    options: int
+    tau: float | None
+    kind: str
+
+    @property
+    def model(self) -> ResponseModel:
+        """Of the human and of the belief."""
+        return Optimal() if self.tau is None else Boltzmann(self.tau)
+
+
+class Measured(NamedTuple):
+    """How the samples of many beliefs differ from the posterior, with standard errors."""
+
+    sessions: int
+    bias: float
+    bias_error: float
+    variance: float
+    variance_error: float
+    effective: float
+    reported: float
+    milliseconds: float
+
+
+def main() -> None:
+    """Print the table of the worst cases, and every case beyond a bound."""
+    parser = common.arguments(__doc__)
+    parser.add_argument("--sessions", type=int, default=200, help="beliefs a case (default 200)")
+    parser.add_argument("--features", default="2,4,6,8,16", help="numbers of features D")
+    parser.add_argument("--csv", type=Path, help="also write every case to this file")
+    parser.add_argument("--workers", type=int, default=2, help="processes (default 2)")
+    options = common.start(parser)
+    sizes = [int(size) for size in options.features.split(",")]
+    cases = [Case(*case) for case in product(sizes, (2, 3, 5), (0.5, 4.5, 30.0, None), KINDS)]
+    with ProcessPoolExecutor(options.workers, get_context("spawn"), _one_thread) as executor:
+        jobs = executor.map(measure, cases, [options.sessions] * len(cases))
+        results = dict(zip(cases, tqdm(jobs, total=len(cases), unit="case"), strict=True))
+    if options.csv is not None:
+        with options.csv.open("w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow([*Case._fields, *Measured._fields])
+            for case, measured in results.items():
+                tau = "optimal" if case.tau is None else case.tau
+                numbers = [f"{number:.4g}" for number in measured]
+                writer.writerow([*case[:2], tau, case.kind, *numbers])
+    common.report("Worst of the cases, K = 2, 3, 5", list(_worst(results)), options.json)
+    beyond = [
+        {**case._asdict(), **measured._asdict()}
+        for case, measured in results.items()
+        if _is_beyond(measured)
+    ]
+    common.report(f"Beyond {BOUND}: {len(beyond)} of {len(results)} cases", beyond, None)
+
+
+def _worst(results: dict[Case, Measured]) -> Iterator[common.Row]:
+    """A row for each number of features and kind of history."""
+    for size, kind in product(sorted({case.features for case in results}), KINDS):
+        some = [m for case, m in results.items() if (case.features, case.kind) == (size, kind)]
+        yield {
+            "D": size,
+            "history": kind,
+            "bias": max(m.bias for m in some),
+            "(se)": max(m.bias_error for m in some),
+            "variance, least": min(m.variance for m in some),
+            "largest": max(m.variance for m in some),
+            "(se) ": max(m.variance_error for m in some),
+            "ESS, least": min(m.effective for m in some),
+            "ms an update": sum(m.milliseconds for m in some) / len(some),
+        }
+
+
+def _one_thread() -> None:
+    torch.set_num_threads(1)
+
+
+def _is_beyond(measured: Measured) -> bool:
+    return measured.bias > BOUND or abs(measured.variance - 1) > BOUND
+
+
+def measure(case: Case, sessions: int) -> Measured:
+    """One case; four times the sessions where the first ones are beyond a bound."""
+    gaps = history(case)
+    exact = posterior(gaps.double().numpy(), case.tau)
+    measured = compare(case, gaps, exact, sessions)
+    if _is_beyond(measured):
+        measured = compare(case, gaps, exact, 4 * sessions)
+    return measured
+
+
+def compare(case: Case, gaps: Tensor, exact: Posterior, sessions: int) -> Measured:
+    """Beliefs that all get the answers with these gaps (H K-1 D), beside the posterior."""
+    generator, belief = Generator().manual_seed(1), Belief(case.model)
+    samples = belief.prior(sessions, case.features, generator)
+    ess = torch.full((sessions,), float(belief.n_samples))
+    start = time.process_time()
+    for h in range(len(gaps)):
+        earlier, newest = gaps[:h].expand(sessions, -1, -1, -1), gaps[h].expand(sessions, -1, -1)
+        samples, ess, _ = belief.update(samples, ess, earlier, newest, generator)
+    seconds = time.process_time() - start
+    mean, total = torch.from_numpy(exact.mean), float(exact.covariance.trace())
+    means = samples.double().mean(1)
+    spread = (samples.double() - mean).square().sum(-1).mean(1) / total
+    bias = float((means.mean(0) - mean).norm()) / math.sqrt(total)
+    noise = float(means.var(0).sum()) / sessions / total
+    return Measured(
+        sessions=sessions,
+        bias=bias,
+        bias_error=math.sqrt(noise + 1 / exact.draws),
+        variance=float(spread.mean()),
+        variance_error=math.sqrt(float(spread.var()) / sessions + 2 / exact.draws),
+        effective=total / float((means - mean).square().sum(-1).mean()),
+        reported=float(1 / (1 / ess).mean()),
+        milliseconds=1000 * seconds / sessions / max(1, len(gaps)),
+    )
+
+
+def history(case: Case, seed: int = 0) -> Tensor:
+    """Feature gaps (H K-1 D) of a human's answers."""
+    generator, model = Generator().manual_seed(seed), case.model
+    omega = uniform_sphere((case.features,), generator)
+    belief = Belief(model, 400)
+    samples, ess = belief.prior(1, case.features, generator), torch.full((1,), 400.0)
+    gaps = torch.zeros(1, 0, case.options - 1, case.features)
+    mixing = _mixing(case, generator)
+    query = torch.zeros(case.options, case.features)
+    for h in range(60 if case.kind == "60 answers" else 8):
+        pool = torch.randn(200, case.options, case.features, generator=generator) @ mixing
+        if case.kind == "greedy":
+            values = score_queries(samples, pool[None], model, information_gain)
+            query = pool[int(values.argmax())]
+        elif case.kind != "contradictory" or h % 4 == 0:
+            query = pool[0]
+        likely = model(samples[0] @ query.T).exp().mean(0)
+        # What a human who never errs cannot answer is no answer.
+        likely = torch.where(likely > 0.005, likely, torch.inf) if case.tau is None else likely
+        answer = model(query @ omega).exp().multinomial(1, generator=generator)[0]
+        if case.kind == "surprising":
+            answer = likely.argmin()
+        if case.kind == "contradictory":
+            answer = torch.tensor(h % case.options)
+            if likely[answer].isinf():
+                continue
+        newest = feature_gaps(query[None], answer[None])
+        samples, ess, _ = belief.update(samples, ess, gaps, newest, generator)
+        gaps = torch.cat([gaps, newest[None]], 1)
+    return gaps[0]
+
+
+def _mixing(case: Case, generator: Generator) -> Tensor:
+    """What turns independent standard normal features into those of the case, (D D)."""
+    scale = {"gaps of 1e-4": 1e-4, "gaps of 1e3": 1e3}.get(case.kind, 1.0)
+    if case.kind != "collinear":
+        return scale * torch.eye(case.features)
+    common_part = torch.randn(case.features, 1, generator=generator)
+    shown = torch.randn(1, case.features, generator=generator)
+    noise = torch.randn(case.features, case.features, generator=generator)
+    return common_part @ shown + 0.01 * noise
+
+
+if __name__ == "__main__":
+    main()

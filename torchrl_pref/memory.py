@@ -1,0 +1,157 @@
+"""About how much memory a run takes, so that one which cannot fit is refused before it starts.
+
+Letters as everywhere: B sessions, H budget, O offers, M samples, N queries, C candidates, K options
+per query, D features, T steps (of a pool: cells of a walk). The bytes of each term were measured,
+as the peak of a process with one of the sizes raised: they are right to about a half, which is
+enough to tell what fits from what does not.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from torchrl_pref.errors import InputError
+
+N_FEATURES = 4
+"""D of the Gridworld."""
+
+HELD_OUT = 2000
+"""Sessions that the held-out protocol runs at once in each worker: strategies times humans."""
+
+MOVED = 2**18
+"""Samples that a belief moves at once."""
+
+LIMIT_FILES = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
+"""Where Linux writes what a container may use."""
+
+
+class Part(NamedTuple):
+    """One thing that a run keeps in memory."""
+
+    what: str
+    size: float
+    """Bytes."""
+    keys: tuple[str, ...]
+    """Settings that it grows with."""
+
+
+def check_memory(settings: dict[str, Any], *pool_shape: int) -> None:
+    """Refuse sizes that cannot fit into this machine's memory.
+
+    Args:
+        settings: of a training or of an evaluation, each in its range.
+        pool_shape: N, K and D; by default those of the Gridworld pools that the settings ask for.
+
+    Raises:
+        InputError: the largest part of the run is estimated at more than there is.
+    """
+    part = max(parts_of(settings, *pool_shape), key=lambda part: part.size)
+    limit = machine_memory()
+    if part.size > limit:
+        named = ", ".join(f"{key}={_value_of(settings, key)}" for key in part.keys)
+        raise InputError(
+            f"{named}: {part.what} would take about {_readable(part.size)} of memory; expected at "
+            f"most the {_readable(limit)} of this machine; lower the largest of these"
+        )
+
+
+def parts_of(settings: dict[str, Any], *pool_shape: int) -> Iterator[Part]:
+    """What a run keeps in memory, estimated."""
+    pool, grid, setup = settings["pool"], settings["grid"], settings["setup"]
+    n_queries, n_options, n_features = pool_shape or (pool["size"], pool["options"], N_FEATURES)
+    of_gridworld = pool["train"] is None
+    sizes = ("pool.size", "pool.options") if of_gridworld else ()
+    if of_gridworld:
+        walks = 150.0 * pool["size"] * pool["options"] * grid["length"]
+        yield Part("the pools", walks, (*sizes, "grid.length"))
+    samples, budget, offers = settings["belief"]["samples"], setup["budget"], _offers(settings)
+    beliefs = ("belief.samples", "setup.budget")
+    if "training" in settings:
+        steps = settings["training"]["steps"] or offers or budget
+        frames = settings["training"]["sessions"] * steps
+        kept = 36.0 * samples * n_features
+        kept += 5.0 * (budget * (16 + 4 * n_options) + 8 * offers + 100)
+        kept += _shown(settings, n_queries, n_options, n_features)
+        own = "setup.offers" if setup["name"] == "feed" else "setup.candidates"
+        keys = ("training.sessions", "training.steps", *beliefs, *sizes, own)
+        yield Part("training", frames * kept, keys)
+    humans = settings["evaluation"]["humans"]
+    if settings.get("protocol") is not None:
+        humans = HELD_OUT * settings["workers"]
+    each = 64.0 * samples * n_features + 220.0 * n_queries
+    each += 2.5 * max(offers, budget) * (16 * budget + 50)
+    counts = "evaluation.humans" if settings.get("protocol") is None else "workers"
+    yield Part("the evaluation", humans * each, (counts, *beliefs, *sizes))
+    yield from _belief_parts(settings, n_options, n_features)
+
+
+def _shown(settings: dict[str, Any], n_queries: int, n_options: int, n_features: int) -> float:
+    """Bytes for each step of a training session that the queries on the table take."""
+    if settings["setup"]["name"] == "feed":
+        return 40.0 * n_options * n_features
+    by_index = settings["policy"]["name"] == "paper"
+    candidates = None if by_index else settings["setup"]["candidates"]
+    each = 700.0 + 10 * n_options * n_features
+    if settings["policy"]["name"] == "attention":
+        each += 2500.0 * n_options
+    return min(n_queries, candidates or n_queries) * each
+
+
+def _belief_parts(settings: dict[str, Any], n_options: int, n_features: int) -> Iterator[Part]:
+    """What an update of the belief holds at once, for sessions in groups of so many samples."""
+    belief, budget = settings["belief"], settings["setup"]["budget"]
+    sessions = settings.get("training", {}).get("sessions", 0)
+    sessions = max(sessions, settings["evaluation"]["humans"])
+    samples = belief["samples"]
+    at_once = max(samples, min(sessions * samples, MOVED))
+    moves = belief["moves"] or n_features
+    directions = 4.0 * n_features * moves * at_once
+    yield Part("moving the belief", directions, ("belief.samples", "belief.moves"))
+    answers = 8.0 * budget * (n_options - 1) * at_once
+    answers += 8.0 * n_options * n_options * samples
+    keys = ("belief.samples", "setup.budget", "pool.options")
+    yield Part("the likelihood of the answers", answers, keys)
+    if settings["objective"] == "entropy":
+        distances = 8.0 * sessions * samples**2
+        yield Part("objective=entropy", distances, ("belief.samples", "evaluation.humans"))
+
+
+def _offers(settings: dict[str, Any]) -> int:
+    """O, 0 where queries are not offered."""
+    setup = settings["setup"]
+    if setup["name"] != "feed":
+        return 0
+    each_ask = 2 if settings["skip"] == "regret" else 5
+    return setup["offers"] or each_ask * setup["budget"]
+
+
+def machine_memory() -> int:
+    """Bytes of memory that this process may use: the machine's, or its container's."""
+    limits = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")] if _has_sysconf() else []
+    for name in LIMIT_FILES:
+        try:
+            limits.append(int(Path(name).read_text()))
+        except (OSError, ValueError):  # no container, or one without a limit
+            continue
+    return min(limits, default=2**40)
+
+
+def _has_sysconf() -> bool:
+    """Whether the system tells its memory in this way; Windows does not."""
+    return "SC_PHYS_PAGES" in getattr(os, "sysconf_names", {})
+
+
+def _value_of(settings: dict[str, Any], key: str) -> Any:
+    """The value of a dotted key."""
+    value: Any = settings
+    for name in key.split("."):
+        value = value.get(name)
+    return "null" if value is None else value
+
+
+def _readable(size: float) -> str:
+    """Bytes in GB, to two digits."""
+    return f"{float(f'{size / 1e9:.2g}'):g} GB" if size < 1e15 else "more than a million GB"

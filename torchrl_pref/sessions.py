@@ -1,0 +1,141 @@
+"""The state of sessions that someone hands to an environment: humans, or sessions half-way.
+
+Shapes: B sessions, M belief samples, N queries in the pool, C candidates, K options per query, D
+features, H query budget, O offers.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from torchrl_pref.errors import InputError
+from torchrl_pref.tensors import check_finite, check_plain, check_range, check_shape
+
+Key = str | tuple[str, ...]
+
+MEANING = {
+    "human.omega": "sessions and features",
+    "human.noise": "sessions, asks (the budget) and options",
+    "human.care": "sessions and one factor",
+    "samples": "sessions, samples of the belief and features",
+    "history.queries": "sessions and asks (the budget)",
+    "history.answers": "sessions and asks (the budget)",
+    "offers": "sessions and offers",
+    "candidates": "sessions and candidates",
+}
+"""What the sizes of each part of the state are; of the others they are sessions and one number."""
+
+
+def check_state(given: TensorDictBase, fresh: TensorDictBase, n_queries: int) -> TensorDict:
+    """What a tensordict holds of the state of sessions, in the types of a fresh state.
+
+    Args:
+        given: some or all keys of the state, and any others, which are left out.
+        fresh: a whole state of the environment, for its shapes.
+        n_queries: N.
+
+    Returns:
+        The keys of ``fresh`` that were given.
+
+    Raises:
+        InputError: a shape, a type or a number is impossible, or the parts contradict each other.
+    """
+    state: dict[Key, Tensor] = {}
+    parts = dict(given.items(True, True))
+    for key, expected in fresh.items(True, True):
+        if key in parts:
+            state[key] = _check_part(_name(key), parts[key], expected)
+    if not state:
+        raise InputError(
+            f"set_state=True with none of {', '.join(map(_name, fresh.keys(True, True)))}: "
+            "expected at least one; give humans as env.reset() returns them, or set_state=False"
+        )
+    _check_ranges(state, fresh, n_queries)
+    _check_vectors(state)
+    _check_history(state)
+    return TensorDict(state, fresh.batch_size, device=fresh.device)
+
+
+def _check_ranges(state: dict[Key, Tensor], fresh: TensorDictBase, n_queries: int) -> None:
+    """Indices point at something, and counts are within the session."""
+    n_asks, n_options = fresh["human", "noise"].shape[1:]
+    n_offers = 0 if fresh.get("offers", None) is None else fresh["offers"].shape[1]
+    limits: dict[Key, tuple[int, int, str]] = {
+        ("history", "queries"): (-1, n_queries - 1, "indices of the pool, -1 where none was asked"),
+        ("history", "answers"): (-1, n_options - 1, "the chosen option, -1 where there is none"),
+        "candidates": (0, n_queries - 1, "indices of the pool"),
+        "offers": (0, n_queries - 1, "indices of the pool"),
+        "n_asked": (0, n_asks, "queries asked so far"),
+        "n_offered": (0, n_offers, "queries offered so far"),
+    }
+    for key, limit in limits.items():
+        if key in state:
+            check_range(_name(key), state[key], *limit)
+
+
+def _name(key: Any) -> str:
+    return key if isinstance(key, str) else ".".join(key)
+
+
+def _check_part(name: str, value: Tensor, expected: Tensor) -> Tensor:
+    """One part of the state, in the type and on the device of a fresh one."""
+    check_plain(name, value)
+    meaning = MEANING.get(name, "sessions and one number")
+    check_shape(
+        name,
+        value,
+        tuple(expected.shape),
+        f"which is {meaning}; take it from an environment of the same sizes",
+    )
+    if value.is_floating_point() != expected.is_floating_point():
+        raise InputError(
+            f"{name} of dtype {value.dtype}: expected {expected.dtype}; convert it, as by "
+            f".to({expected.dtype})"
+        )
+    value = value.detach().to(expected)
+    if value.is_floating_point():
+        check_finite(name, value)
+    return value
+
+
+def _check_vectors(state: dict[Key, Tensor]) -> None:
+    """Samples lie on the unit sphere, and a human has a direction."""
+    samples, omega = state.get("samples"), state.get(("human", "omega"))
+    if samples is not None and ((samples.norm(dim=-1) - 1).abs() > 0.01).any():
+        raise InputError(
+            "samples that are not of length 1: expected points of the unit sphere, as tau carries "
+            "the scale; divide them by their length, as by torch.nn.functional.normalize"
+        )
+    if omega is not None and (omega == 0).all(-1).any():
+        raise InputError("human.omega of length 0: expected a direction; give weights above zero")
+    if (state.get(("human", "care"), torch.ones(1)) <= 0).any():
+        raise InputError("human.care of 0 or less: expected a factor above 0; 1 is the model's tau")
+
+
+def _check_history(state: dict[Key, Tensor]) -> None:
+    """The asked queries are the first ``n_asked``, and the belief knows of their answers."""
+    queries, n_asked = state.get(("history", "queries")), state.get("n_asked")
+    answers = state.get(("history", "answers"))
+    if queries is None and answers is None and n_asked is None:
+        return
+    if queries is None or answers is None or n_asked is None:
+        raise InputError(
+            "a history in part: expected history.queries, history.answers and n_asked together; "
+            "give all three, or none for sessions that begin"
+        )
+    asked = queries >= 0
+    first = torch.arange(queries.shape[1], device=queries.device) < n_asked
+    if (asked != first).any() or ((answers >= 0) & ~asked).any():
+        raise InputError(
+            "history and n_asked contradict each other: expected n_asked queries at the start of "
+            "each history, -1 after them, and no answer without a query"
+        )
+    if asked.any() and "samples" not in state:
+        raise InputError(
+            "a history of answers without the samples of the belief that they led to: expected "
+            "both; give samples too, or leave the history out"
+        )

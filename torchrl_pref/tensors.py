@@ -1,0 +1,89 @@
+"""Tensors that cannot be used, refused where they enter: what came, what was expected, how to mend.
+
+Each check reads a tensor once and costs a few microseconds: they stand at the doors of the package
+(a step, a reset, an update of the belief) and not in its inner loops.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from torch import Tensor
+
+from torchrl_pref.errors import InputError
+
+
+def check_plain(name: str, tensor: Any) -> Tensor:
+    """Return ``tensor`` if it is a dense one of real numbers, with values.
+
+    Raises:
+        InputError: it is not.
+    """
+    if not isinstance(tensor, Tensor):
+        raise InputError(
+            f"{name} of type {type(tensor).__name__}: expected a torch.Tensor; "
+            "torch.as_tensor(…) makes one of an array or of lists"
+        )
+    for bad, what, mend in (
+        (tensor.is_complex(), "complex numbers", "take .real or .abs()"),
+        (tensor.is_quantized, "quantised numbers", "call .dequantize()"),
+        (tensor.is_nested, "a nested tensor", "pad it, as by .to_padded_tensor(0)"),
+        (tensor.is_sparse or "sparse" in str(tensor.layout), "a sparse tensor", "call .to_dense()"),
+        (tensor.is_meta, "a tensor without values (meta)", "make it on a device"),
+    ):
+        if bad:
+            raise InputError(f"{name}: got {what}; expected a dense tensor of real numbers; {mend}")
+    return tensor
+
+
+def check_finite(name: str, *tensors: Tensor) -> None:
+    """Refuse NaN and infinity in any of some tensors.
+
+    Raises:
+        InputError: there is one.
+    """
+    # One entry that is not finite makes the sum so: a single number to look at for each tensor.
+    if not math.isfinite(sum(float(tensor.sum()) for tensor in tensors)):
+        raise InputError(
+            f"{name}: NaN, infinity or a number too large for float32; expected finite numbers; "
+            "look where they were made"
+        )
+
+
+def check_range(name: str, values: Any, low: int, high: int, meaning: str) -> Tensor:
+    """Return a tensor of whole numbers, as int64, if all are from ``low`` to ``high``.
+
+    Args:
+        name: of the numbers, for the message.
+        values: the tensor; truth values count as 0 and 1.
+        low, high: both allowed.
+        meaning: what the numbers are, for the message.
+
+    Raises:
+        InputError: the values are no whole numbers, or one is out of range.
+    """
+    if not isinstance(values, Tensor) or values.is_floating_point() or values.is_complex():
+        kind = f"dtype {values.dtype}" if isinstance(values, Tensor) else type(values).__name__
+        raise InputError(
+            f"{name} of {kind}: expected a tensor of whole numbers from {low} to {high}, {meaning}"
+        )
+    if values.numel():
+        least, most = values.aminmax()
+        if int(least) < low or int(most) > high:
+            raise InputError(
+                f"{name} from {int(least)} to {int(most)}: expected {low} to {high}, {meaning}"
+            )
+    return values.long()
+
+
+def check_shape(name: str, tensor: Tensor, expected: tuple[int, ...], meaning: str) -> None:
+    """Refuse a tensor of another shape.
+
+    Raises:
+        InputError: the shape is not the one expected.
+    """
+    if tuple(tensor.shape) != tuple(expected):
+        raise InputError(
+            f"{name} of shape {tuple(tensor.shape)}: expected {tuple(expected)}, {meaning}"
+        )

@@ -1,0 +1,208 @@
+"""What the user typed: as Hydra composed it, checked before Hydra makes a folder for it."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import re
+import shlex
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NoReturn
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from torchrl_pref.errors import InputError, one_line_errors
+
+Settings = dict[str, Any]
+
+
+class Gate(Callback):
+    """Refuses what was typed before Hydra makes a folder for it."""
+
+    check: Callable[[Settings], None] | None = None
+    """The script's own."""
+    passed = False
+    """Whether errors are no longer the input's."""
+    made: tuple[Path, ...] = ()
+    """The folders that Hydra makes for a single run, the innermost first."""
+
+    def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Check the whole configuration."""
+        with one_line_errors(), refusals():
+            HydraConfig.instance().set_config(config)
+            Gate._check_hydra(config)
+            folder = _check_folder("hydra.run.dir", config.hydra.run.dir)
+            if Gate.check is not None:
+                Gate.check(plain_settings(config))
+        Gate.made = tuple(path for path in (folder, *folder.parents) if not path.exists())
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Check where a sweep goes; each of its jobs checks its own configuration."""
+        with one_line_errors(), refusals():
+            Gate._check_hydra(config)
+            _check_folder("hydra.sweep.dir", config.hydra.sweep.dir)
+
+    def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """From here on errors are a job's own."""
+        Gate.passed = True
+
+    @staticmethod
+    def _check_hydra(config: DictConfig) -> None:
+        """Refuse what of Hydra's own keys would change the meaning of ours."""
+        if config.hydra.job.chdir:
+            raise InputError(
+                f"hydra.job.chdir={config.hydra.job.chdir}: paths are meant as from the folder "
+                "that you are in; remove hydra.job.chdir"
+            )
+        inside = config.hydra.output_subdir
+        if inside is not None and not re.fullmatch(r"[\w-][\w.-]{0,99}", inside):
+            raise InputError(
+                f"hydra.output_subdir={inside!r}: expected the name of a folder within that of the "
+                "run, such as hydra.output_subdir=hydra, or null"
+            )
+
+
+def discard_folders() -> None:
+    """Remove the folders that Hydra made for a single run, as far as nothing is in them."""
+    with contextlib.suppress(OSError):
+        for path in Gate.made:
+            path.rmdir()
+
+
+@contextlib.contextmanager
+def refusals() -> Iterator[None]:
+    """What Hydra cannot make a configuration of, as input that cannot be used.
+
+    Raises:
+        InputError: the input was at fault.
+    """
+    try:
+        yield
+    except (HydraException, OmegaConfBaseException) as error:
+        text = re.sub(
+            r"\.? (Config search path:|full_key:|To append to your config).*",
+            "",
+            " ".join(str(error).split()),
+        )
+        raise InputError(f"{text}; --help lists the keys and their values") from None
+    except Exception as error:
+        if Gate.passed or isinstance(error, (InputError, OSError)):
+            raise
+        raise InputError(
+            f"{shlex.join(sys.argv[1:])}: cannot be read ({type(error).__name__}: {error}); --help "
+            "lists the keys and their values"
+        ) from None
+
+
+@contextlib.contextmanager
+def checked_flags() -> Iterator[None]:
+    """Say in one line what is wrong with a flag; refuse those that go past the checks.
+
+    Raises:
+        InputError: one of those was typed.
+    """
+    for argument in sys.argv[1:]:
+        if argument.startswith("--e"):  # also where it is abbreviated
+            raise InputError(
+                f"{argument}: reruns are read from a pickle, which could run any code; type the "
+                "settings again, or go on with a run by resume=<its folder>"
+            )
+        if argument.startswith(("-cn", "-cp", "--config-n", "--config-p")):
+            raise InputError(
+                f"{argument}: the configuration of this script is its own; settings of yours go "
+                "into a file experiment/<name>.yaml, chosen by experiment=<name>, in conf or in "
+                "the folder named by --config-dir"
+            )
+
+    def error(self: argparse.ArgumentParser, message: str) -> NoReturn:
+        raise InputError(f"{message}; settings are typed as key=value, --help lists them")
+
+    # Hydra's own parser, which nobody else is handed, would print its usage as well.
+    before = argparse.ArgumentParser.error
+    argparse.ArgumentParser.error = error  # type: ignore[method-assign]
+    try:
+        yield
+    finally:
+        argparse.ArgumentParser.error = before  # type: ignore[method-assign]
+
+
+def plain_settings(config: DictConfig) -> Settings:
+    """The composed configuration as plain values.
+
+    Raises:
+        InputError: a group was renamed from within.
+    """
+    own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+    settings = OmegaConf.to_container(own, resolve=True)
+    assert isinstance(settings, dict)
+    choices = HydraConfig.get().runtime.choices
+    for group in ("setup", "policy"):
+        section, chosen = settings.get(group), choices.get(group)
+        name = section.get("name", chosen) if isinstance(section, dict) else chosen
+        if isinstance(chosen, str) and name != chosen:
+            raise InputError(
+                f"{group}.name={name!r}: type {group}={name} to choose another {group}"
+            )
+    return {str(key): value for key, value in settings.items()}
+
+
+def typed_overrides() -> list[str]:
+    """The keys=values that the user typed."""
+    return list(HydraConfig.get().overrides.task)
+
+
+def was_typed(key: str) -> bool:
+    """Whether the user typed a value for a key."""
+    return any(override.split("=")[0].lstrip("+") == key for override in typed_overrides())
+
+
+def refuse_other_overrides(source: str, allowed: tuple[str, ...]) -> None:
+    """Refuse to ignore what the user typed where a checkpoint decides.
+
+    Args:
+        source: the key that names the checkpoint.
+        allowed: keys, or sections ending in a dot, that may be typed beside it.
+
+    Raises:
+        InputError: another key was typed.
+    """
+    for override in typed_overrides():
+        key = override.split("=")[0].lstrip("+~")
+        if key != source and not key.startswith(allowed):
+            raise InputError(
+                f"{override}: {source}=… brings its own settings and only "
+                f"{', '.join(allowed)} may be typed beside it; remove {key}, or drop {source}"
+            )
+
+
+def _check_folder(key: str, value: str) -> Path:
+    """The absolute path of a folder in which files may be written.
+
+    Raises:
+        InputError: it is the present folder or around it, or it cannot be made.
+    """
+    folder, here = Path(os.path.abspath(value)), Path.cwd()
+    if not value.strip() or folder == here or folder in here.parents:
+        raise InputError(
+            f"{key}={value!r}: that is the folder that you are in, or one around it; expected a "
+            f"folder for this alone, such as {key}=outputs/first"
+        )
+    if not value.isprintable() or any(len(os.fsencode(part)) > 255 for part in folder.parts):
+        raise InputError(f"{key}={value!r}: no folder can have this name; choose another")
+    nearest = next(path for path in (folder, *folder.parents) if path.exists())
+    try:
+        with tempfile.TemporaryFile(dir=nearest):
+            return folder
+    except OSError as error:
+        raise InputError(
+            f"{key}={value}: the run folder cannot be written ({nearest}: {error.strerror}); set "
+            f"{key} to a folder that can be"
+        ) from None

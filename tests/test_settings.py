@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 
 import torchrl_pref
 from benchmarks.bad_settings import FAULTS, every_command, run_forked
-from torchrl_pref import attention, memory, objectives, settings
+from torchrl_pref import attention, belief, memory, objectives, sampler, settings
 from torchrl_pref.errors import InputError, one_line
 
 ROOT = Path(__file__).parent.parent
@@ -139,3 +139,9 @@ def test_the_package_gives_its_names_when_they_are_used() -> None:
         assert getattr(torchrl_pref, name).__name__ == name
     with pytest.raises(AttributeError, match="no attribute 'Nothing'"):
         _ = torchrl_pref.Nothing
+
+
+def test_the_estimate_knows_what_the_belief_does_at_once() -> None:
+    """The estimate is made before anything heavy is imported, so the numbers stand there again."""
+    assert memory.MOVED == belief.MOVED
+    assert memory.UNIFORMS == 2 + sampler.MAX_SHRINKS

@@ -21,8 +21,11 @@ N_FEATURES = 4
 HELD_OUT = 2000
 """Sessions that the held-out protocol runs at once in each worker: strategies times humans."""
 
-MOVED = 2**18
-"""Samples that a belief moves at once."""
+MOVED = 2**20
+"""Moves of samples that a belief makes at once, see ``belief.py``."""
+
+UNIFORMS = 18
+"""Random numbers of a move, see ``sampler.MAX_SHRINKS``."""
 
 LIMIT_FILES = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 """Where Linux writes what a container may use."""
@@ -106,9 +109,9 @@ def _belief_parts(settings: dict[str, Any], n_options: int, n_features: int) -> 
     sessions = settings.get("training", {}).get("sessions", 0)
     sessions = max(sessions, settings["evaluation"]["humans"])
     samples = belief["samples"]
-    at_once = max(samples, min(sessions * samples, MOVED))
-    moves = belief["moves"] or n_features
-    directions = 4.0 * n_features * moves * at_once
+    moves = belief["moves"] or max(4, n_features)
+    at_once = max(samples, min(sessions * samples, MOVED // moves))
+    directions = 4.0 * (UNIFORMS * moves + 4 * n_features) * at_once
     yield Part("moving the belief", directions, ("belief.samples", "belief.moves"))
     answers = 8.0 * budget * (n_options - 1) * at_once
     answers += 8.0 * n_options * n_options * samples

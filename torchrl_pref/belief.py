@@ -168,12 +168,18 @@ class Belief:
         # Where an answer can be impossible no power of its likelihood makes it less so.
         possible = foreseen.isfinite().all(1)
         surprised = possible & (foreseen.exp().mean(1) < SURPRISE)
+        few = ~surprised & (kish_share(foreseen) < MIN_SHARE)
         inflation = self.n_samples / ess
-        if not surprised.any():
+        plain = ~(surprised | few)
+        if plain.all():
             after = self._let_in(samples, inflation, answers, generator)
         else:
-            after = samples.clone(), inflation, torch.ones_like(surprised)
-            for who, condition in ((~surprised, self._let_in), (surprised, self._begin_anew)):
+            after = samples.clone(), inflation, torch.ones_like(plain)
+            for who, condition in (
+                (plain, self._let_in),
+                (few, self._let_in_by_stages),
+                (surprised, self._begin_anew),
+            ):
                 if who.any():
                     some = condition(samples[who], inflation[who], answers[who], generator)
                     for whole, part in zip(after, some, strict=True):
@@ -181,6 +187,20 @@ class Belief:
         return Update(after[0], self.n_samples / after[1], after[2])
 
     def _let_in(
+        self, samples: Tensor, inflation: Tensor, answers: Tensor, generator: Generator
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Let in the last of the answers at once.
+
+        Returns:
+            Samples (S M D), inflation (S), and that the answer was used (S).
+        """
+        model = self.response_model
+        log_weights = model.log_likelihood(_gaps(samples, answers[:, -1]))
+        target = Target(answers, torch.zeros_like(inflation), torch.ones_like(inflation), model)
+        after = self._resample_move(samples, inflation, log_weights, target, generator)
+        return *after, torch.ones_like(inflation, dtype=torch.bool)
+
+    def _let_in_by_stages(
         self, samples: Tensor, inflation: Tensor, answers: Tensor, generator: Generator
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Let in the last of the answers, by a slack that falls to zero.
@@ -193,7 +213,6 @@ class Belief:
         samples, inflation = samples.clone(), inflation.clone()
         slack = torch.full_like(inflation, math.inf)
         todo = torch.arange(len(samples), device=samples.device)
-        staged = torch.zeros_like(slack, dtype=torch.bool)
         for stage in range(MAX_STAGES):
             if todo.numel() == 0:
                 break
@@ -210,16 +229,12 @@ class Belief:
             given = samples[todo], inflation[todo], log_weights, target, generator
             samples[todo], inflation[todo] = self._resample_move(*given)
             todo = todo[next_slack > 0]
-            staged[todo] = True
-        used = slack == 0
-        if staged.any():
-            # In float64, where one gap and its negative differ by nothing that counts.
-            gaps = _gaps(samples.double(), answers.double())
-            agrees = model.agrees(gaps[:, :, -1]) & (model.joint_log_likelihood(gaps) > -math.inf)
-            used &= agrees.any(1) | ~staged
-            samples = torch.where(used[:, None, None], samples, before[0])
-            inflation = torch.where(used, inflation, before[1])
-        return samples, inflation, used
+        # In float64, where one gap and its negative differ by nothing that counts.
+        gaps = _gaps(samples.double(), answers.double())
+        agrees = model.agrees(gaps[:, :, -1]) & (model.joint_log_likelihood(gaps) > -math.inf)
+        used = (slack == 0) & agrees.any(1)
+        samples = torch.where(used[:, None, None], samples, before[0])
+        return samples, torch.where(used, inflation, before[1]), used
 
     def _begin_anew(
         self, samples: Tensor, inflation: Tensor, answers: Tensor, generator: Generator

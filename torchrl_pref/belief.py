@@ -95,8 +95,9 @@ class Belief:
     Args:
         response_model: how the belief thinks the human answers. It may differ from how they do.
         samples: M, at least 2.
-        moves: Markov moves after each resampling, at least 1; None: as many as there are features,
-            and at least 4. They are repeated where the samples have not forgotten where they were.
+        moves: Markov moves after each resampling, at least 1; None: as many as there are features
+            (D²/8 beyond 8), and at least 4. They are repeated where the samples have not forgotten
+            where they were.
 
     Raises:
         InputError: there is no response model, or ``samples`` or ``moves`` is too small.
@@ -156,8 +157,10 @@ class Belief:
         return Update(*(torch.cat(field) for field in zip(*updates, strict=True)))
 
     def _moves_for(self, n_features: int) -> int:
-        """V, moves along one frame of directions at least."""
-        return max(4, n_features) if self.n_moves is None else self.n_moves
+        """V: with many features 100 samples tell less and less well where they spread."""
+        if self.n_moves is not None:
+            return self.n_moves
+        return max(4, n_features, n_features**2 // 8)
 
     def _update(
         self, samples: Tensor, ess: Tensor, earlier: Tensor, newest: Tensor, generator: Generator
@@ -184,7 +187,8 @@ class Belief:
                     some = condition(samples[who], inflation[who], answers[who], generator)
                     for whole, part in zip(after, some, strict=True):
                         whole[who] = part
-        return Update(after[0], self.n_samples / after[1], after[2])
+        moved, inflation, used = after
+        return Update(moved, torch.where(used, self.n_samples / inflation, ess), used)
 
     def _let_in(
         self, samples: Tensor, inflation: Tensor, answers: Tensor, generator: Generator

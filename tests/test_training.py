@@ -249,7 +249,8 @@ def test_warm_up_spares_the_actor_and_the_average_follows() -> None:
 
 def test_ctrl_c_stops_after_the_update_and_saves(tmp_path: Path) -> None:
     trainer, _ = trainer_of(settings_of(updates=1000, save_every=1000))
-    before = signal.getsignal(signal.SIGINT)
+    # The tests may run in the background, where Ctrl-C is ignored.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     learn, saved = trainer.update, []
 
     def interrupt(batch: Any) -> None:
@@ -258,9 +259,13 @@ def test_ctrl_c_stops_after_the_update_and_saves(tmp_path: Path) -> None:
         learn(batch)
 
     trainer.update = interrupt  # type: ignore[method-assign]
-    assert not trainer.run(tmp_path, lambda: saved.append(trainer.progress.update))
-    assert saved == [3]
-    assert signal.getsignal(signal.SIGINT) is before
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            trainer.run(tmp_path, lambda: saved.append(trainer.progress.update))
+        assert saved == [3]
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.parametrize(

@@ -126,9 +126,9 @@ class Belief:
         at a slack of zero, which is the exact posterior.
 
         An answer that hardly any sample foresaw says that most of the posterior may lie where there
-        are no samples, which no move would mend. The belief then begins anew from the prior, with
-        more samples, and lets in all answers together, by a power of their likelihood that rises to
-        one (Neal, *Annealed importance sampling*, 2001).
+        are no samples, which no move would mend. The belief then begins anew from the prior and
+        lets in all answers together, by a power of their likelihood that rises to one (Neal,
+        *Annealed importance sampling*, 2001).
 
         The effective sample size follows the samples through it all. Resampling multiplies the
         variance of the mean, by the average multiplicity where all samples count alike; moves after

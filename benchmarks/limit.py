@@ -23,7 +23,7 @@ from torch import Generator, Tensor
 from benchmarks import common
 from torchrl_pref.acquisition import information_gain, predict_answers, score_queries
 from torchrl_pref.belief import Belief, feature_gaps, uniform_sphere
-from torchrl_pref.resampling import poles_of
+from torchrl_pref.resampling import FRAMES, poles_of
 from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel, compiled_constants
 from torchrl_pref.sampler import ARC, MAX_SHRINKS
 from torchrl_pref.sampler_cpu import compiled_moves
@@ -125,14 +125,14 @@ def _moving(model: ResponseModel, n_answers: int, repeats: int) -> common.Row:
         newest = feature_gaps(queries, answers)
         samples, ess, _ = belief.update(samples, ess, gaps, newest, generator)
         gaps = torch.cat([gaps, newest.unsqueeze(1)], 1)
-    normal = torch.randn((SESSIONS, MOVES, pool.shape[-1]), generator=generator)
+    normal = torch.randn((SESSIONS, FRAMES, MOVES, pool.shape[-1]), generator=generator)
     slack, power = torch.zeros(SESSIONS), torch.ones(SESSIONS)
     uniform = torch.rand((MOVES, *samples.shape[:2], 2 + MAX_SHRINKS), generator=generator)
     constants = compiled_constants(model)
     assert constants is not None
 
     def step(shrinks: int = MAX_SHRINKS, moves: int = MOVES) -> Tensor:
-        poles = poles_of(samples, normal[:, :moves])
+        poles = poles_of(samples, normal[:, :, :moves])
         luck = uniform[:moves, ..., : 2 + shrinks]
         return compiled_moves(samples, poles, luck, gaps, slack, power, ARC, *constants)
 

@@ -18,7 +18,7 @@ sys.path[0] = str(Path(__file__).resolve().parents[1])  # this folder's select.p
 import csv
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from itertools import product
 from multiprocessing import get_context
@@ -90,15 +90,8 @@ def main() -> None:
     cases = [Case(*case) for case in product(sizes, (2, 3, 5), (0.5, 4.5, 30.0, None), KINDS)]
     with ProcessPoolExecutor(options.workers, get_context("spawn"), _one_thread) as executor:
         jobs = executor.map(measure, cases, [options.sessions] * len(cases))
-        results = dict(zip(cases, tqdm(jobs, total=len(cases), unit="case"), strict=True))
-    if options.csv is not None:
-        with options.csv.open("w", newline="") as file:
-            writer = csv.writer(file)
-            writer.writerow([*Case._fields, *Measured._fields])
-            for case, measured in results.items():
-                tau = "optimal" if case.tau is None else case.tau
-                numbers = [f"{number:.4g}" for number in measured]
-                writer.writerow([*case[:2], tau, case.kind, *numbers])
+        done = zip(cases, tqdm(jobs, total=len(cases), unit="case"), strict=True)
+        results = dict(done if options.csv is None else _written(done, options.csv))
     common.report("Worst of the cases, K = 2, 3, 5", list(_worst(results)), options.json)
     beyond = [
         {**case._asdict(), **measured._asdict()}
@@ -106,6 +99,19 @@ def main() -> None:
         if _is_beyond(measured)
     ]
     common.report(f"Beyond {BOUND}: {len(beyond)} of {len(results)} cases", beyond, None)
+
+
+def _written(done: Iterable[tuple[Case, Measured]], path: Path) -> Iterator[tuple[Case, Measured]]:
+    """Each result, in the file as soon as it is there: all of them take an hour."""
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow([*Case._fields, *Measured._fields])
+        for case, measured in done:
+            tau = "optimal" if case.tau is None else case.tau
+            numbers = [f"{number:.4g}" for number in measured]
+            writer.writerow([*case[:2], tau, case.kind, *numbers])
+            file.flush()
+            yield case, measured
 
 
 def _worst(results: dict[Case, Measured]) -> Iterator[common.Row]:

@@ -10,6 +10,7 @@ from torch import Generator, Tensor
 
 from torchrl_pref.belief import Belief, feature_gaps, uniform_sphere
 from torchrl_pref.resampling import (
+    FRAMES,
     GROUPS,
     explained_share,
     frames_of,
@@ -46,7 +47,7 @@ def test_compiled_moves_go_where_those_in_tensors_do(
         samples, ess, _ = belief.update(samples, ess, gaps, newest, generator)
         gaps[:, h] = newest  # until then a row of zeros
         if h in (0, 4, 8):
-            normal = torch.randn(sessions, 1, n_features, generator=generator)
+            normal = torch.randn(sessions, FRAMES, 1, n_features, generator=generator)
             poles = poles_of(samples, normal)
             uniform = torch.rand(1, sessions, 100, 2 + MAX_SHRINKS, generator=generator)
             slack = torch.rand(sessions, generator=generator) / 10
@@ -69,7 +70,7 @@ def test_compiled_moves_go_where_those_in_tensors_do(
 @pytest.mark.parametrize("model", RESPONSE_MODELS, ids=str)
 def test_moves_in_tensors_stay_on_their_device(model: ResponseModel) -> None:
     """``meta`` stands for a GPU: nothing is computed, but devices must not be mixed."""
-    shapes = (5, 30, 4), (5, 6, 4), (6, 5, 30, 2 + MAX_SHRINKS), (5, 7, 1, 4), (5,), (5,)
+    shapes = (5, 30, 4), (5, FRAMES, 6, 4), (6, 5, 30, 2 + MAX_SHRINKS), (5, 7, 1, 4), (5,), (5,)
     samples, normal, uniform, *rest = (torch.empty(shape, device="meta") for shape in shapes)
     poles = poles_of(samples, normal)
     moved = tensor_moves(samples, poles, uniform, Target(*rest, model))
@@ -104,7 +105,8 @@ def test_resampling_follows_the_weights(draw: object, generator: Generator) -> N
     log_weights = torch.tensor([[0.0, math.log(2), -math.inf, 0.0]]).expand(2000, 4)
     samples = torch.eye(4).expand(2000, 4, 4)
     offset = torch.rand(2000, generator=generator)
-    copies, factor = draw(samples, log_weights, offset)  # type: ignore[operator]
+    order = torch.arange(4)
+    copies, factor = draw(samples, log_weights, offset, order)  # type: ignore[operator]
     assert copies.mean(0).sum(0).tolist() == pytest.approx([1, 2, 0, 1], abs=0.05)
     assert (factor >= 1).all()
     assert (factor <= 2).all()
@@ -112,7 +114,7 @@ def test_resampling_follows_the_weights(draw: object, generator: Generator) -> N
     shares = torch.tensor([0.3, 0.7, 1.2, 1.8])
     offset = torch.rand(20_000, generator=generator)
     many = samples[:1].expand(20_000, 4, 4)
-    copies, _ = draw(many, shares.log().expand(20_000, 4), offset)  # type: ignore[operator]
+    copies, _ = draw(many, shares.log().expand(20_000, 4), offset, order)  # type: ignore[operator]
     assert copies.mean(0).sum(0).tolist() == pytest.approx(shares.tolist(), abs=0.02)
     assert float(kish_share(log_weights[0])) == pytest.approx(16 / (4 * 6))
     assert float(kish_share(torch.full((4,), -math.inf))) == 0
@@ -122,8 +124,9 @@ def test_resampling_is_the_same_compiled_and_in_tensors(generator: Generator) ->
     samples = torch.randn(50, 30, 3, generator=generator)
     log_weights = 3 * torch.randn(50, 30, generator=generator)
     offset = torch.rand(50, generator=generator)
-    compiled, factor = compiled_resample(samples, log_weights, offset)
-    copies, expected = tensor_resample(samples, log_weights, offset)
+    order = torch.randperm(30, generator=generator)
+    compiled, factor = compiled_resample(samples, log_weights, offset, order)
+    copies, expected = tensor_resample(samples, log_weights, offset, order)
     # A weight that ends at the very place of a draw may be judged differently.
     assert (compiled == copies).float().mean() > 0.999
     assert torch.allclose(factor, expected, rtol=0.02)
@@ -132,8 +135,22 @@ def test_resampling_is_the_same_compiled_and_in_tensors(generator: Generator) ->
 def test_equal_weights_leave_every_sample(generator: Generator) -> None:
     samples = torch.randn(7, 40, 3, generator=generator)
     copies, factor = resample(samples, torch.zeros(7, 40), generator)
-    assert torch.equal(copies, samples)
+    assert torch.equal(copies.sort(1).values, samples.sort(1).values)
     assert torch.allclose(factor, torch.ones(7))
+
+
+@pytest.mark.parametrize("n_samples", [40, 100])
+def test_copies_share_a_group_and_no_directions(n_samples: int, generator: Generator) -> None:
+    """A direction must not depend on a copy of what moves along it, nor be that of the copy."""
+    samples = torch.arange(float(n_samples)).reshape(1, n_samples, 1).expand(5, -1, 2)
+    every_second = torch.tensor([0.0, -math.inf]).repeat(5, n_samples // 2)
+    copies, _ = resample(samples, every_second, generator)
+    first, second = copies[0, :, 0].argsort(stable=True).reshape(-1, 2).unbind(1)
+    assert torch.equal(copies[0, first], copies[0, second])
+    group = group_of(n_samples, GROUPS, samples.device)
+    assert torch.equal(group[first], group[second])
+    directions = group_of(n_samples, GROUPS * FRAMES, samples.device)
+    assert (directions[first] != directions[second]).all()
 
 
 def test_what_earlier_places_explain(generator: Generator) -> None:

@@ -40,7 +40,7 @@ RESTART_SHARE, RESTART_STAGES = 0.5, 500
 """What each stage of a new beginning keeps, and how many stages there may be: it must find every
 mode, and how much each holds."""
 
-FORGOTTEN = 0.85
+FORGOTTEN = 0.95
 """Moves are repeated until the effective sample size is this share of the samples, at most
 ``MAX_ROUNDS`` times."""
 

@@ -1,9 +1,11 @@
 """What the belief's sequential Monte Carlo is made of: weights, copies, where samples spread.
 
-Shapes: S sessions, M samples, D features, V moves, P groups of samples.
+Shapes: S sessions, M samples, D features, V moves, P groups of samples, F sets of directions.
 """
 
 from __future__ import annotations
+
+from functools import lru_cache
 
 import torch
 from torch import Generator, Tensor
@@ -12,6 +14,10 @@ from torchrl_pref.resampling_cpu import compiled_poles, compiled_resample, compi
 
 GROUPS = 10
 """Samples move in directions drawn from the spread of the other groups: of nine tenths of them."""
+
+FRAMES = 2
+"""Sets of directions in a group, which its samples take in turn: copies of one that moved in the
+same directions would stay more alike."""
 
 
 def kish_share(log_weights: Tensor) -> Tensor:
@@ -31,21 +37,34 @@ def resample(samples: Tensor, log_weights: Tensor, generator: Generator) -> tupl
         generator: the source of randomness, on the device of the samples.
 
     Returns:
-        Samples (S M D), copies of one following each other, and by what this multiplies the
-        variance of their mean (S).
+        Samples (S M D), copies of one within a group and with directions of their own, and by what
+        this multiplies the variance of their mean (S).
     """
     offset = torch.rand(len(samples), generator=generator, device=samples.device)
+    order = _order(samples.shape[1], samples.device)
     if samples.is_cpu:
-        return compiled_resample(samples, log_weights, offset)
-    return tensor_resample(samples, log_weights, offset)
+        return compiled_resample(samples, log_weights, offset, order)
+    return tensor_resample(samples, log_weights, offset, order)
 
 
-def tensor_resample(samples: Tensor, log_weights: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
-    """:func:`resample` in tensors, with its number in [0, 1) for each session given (S)."""
+@lru_cache(maxsize=16)
+def _order(n_samples: int, device: torch.device) -> Tensor:
+    """(M), which of the copies in a row goes to each place: those that a group gets are dealt to
+    its sets of directions."""
+    places = torch.arange(n_samples, device=device)
+    group = group_of(n_samples, min(GROUPS, n_samples), device)
+    turn = places - torch.searchsorted(group, group)
+    return torch.argsort(group * FRAMES + turn % FRAMES, stable=True)
+
+
+def tensor_resample(
+    samples: Tensor, log_weights: Tensor, offset: Tensor, order: Tensor
+) -> tuple[Tensor, Tensor]:
+    """:func:`resample` in tensors, with its number in [0, 1) for each session (S) and the order of
+    the copies (M) given."""
     n_samples = log_weights.shape[-1]
     cumulative = log_weights.softmax(-1).cumsum(-1, dtype=torch.float64)
-    steps = torch.arange(n_samples, device=log_weights.device)
-    points = (steps + offset.double().unsqueeze(1)) / n_samples * cumulative[:, -1:]
+    points = (order + offset.double().unsqueeze(1)) / n_samples * cumulative[:, -1:]
     chosen = torch.searchsorted(cumulative, points).clamp(max=n_samples - 1)
     copies = samples.gather(1, chosen.unsqueeze(-1).expand_as(samples))
     return copies, variance_of_copies(chosen, copies)
@@ -114,11 +133,12 @@ def frames_of(normal: Tensor) -> Tensor:
 
 
 def poles_of(samples: Tensor, normal: Tensor) -> Tensor:
-    """Directions of moves, from the spread of samples (S M D) and normal numbers (S V D).
+    """Directions of moves, from the spread of samples (S M D) and normal numbers (S F V D).
 
     Returns:
-        (V S P D), for each group of samples as long as a Gaussian with the covariance of the other
-        samples is wide in that direction.
+        (V S P D), each as long as a Gaussian with the covariance of the samples outside the group
+        is wide in that direction. There are F poles for each of the :data:`GROUPS`, and so here P
+        is F times as many.
     """
     if samples.is_cpu:
         return compiled_poles(samples, normal, min(GROUPS, samples.shape[1]))
@@ -127,8 +147,9 @@ def poles_of(samples: Tensor, normal: Tensor) -> Tensor:
 
 def tensor_poles(samples: Tensor, normal: Tensor) -> Tensor:
     """:func:`poles_of` in tensors."""
-    poles = frames_of(normal) @ spread_of_others(samples).flatten(1, 2).mT
-    return poles.unflatten(2, (-1, samples.shape[2])).transpose(0, 1)
+    frames = frames_of(normal.flatten(0, 1)).unflatten(0, normal.shape[:2])
+    poles = torch.einsum("spde,sfve->vspfd", spread_of_others(samples), frames)
+    return poles.flatten(2, 3)
 
 
 def explained_share(before: Tensor, after: Tensor) -> Tensor:

@@ -2,7 +2,7 @@
 
 For one session torch would spend more time on starting its operations than on the work itself.
 
-Shapes: S sessions, M samples, D features, V moves, P groups of samples.
+Shapes: S sessions, M samples, D features, V moves, P groups of samples, F sets of directions.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ Array = np.ndarray[Any, np.dtype[Any]]
 
 
 def compiled_resample(
-    samples: Tensor, log_weights: Tensor, offset: Tensor
+    samples: Tensor, log_weights: Tensor, offset: Tensor, order: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Samples (S M D) after systematic resampling with offsets (S), and by what it multiplies the
-    variance of their mean (S)."""
+    """Samples (S M D) after systematic resampling with offsets (S), in an order (M), and by what it
+    multiplies the variance of their mean (S)."""
     copies, factor = torch.empty_like(samples), torch.empty_like(offset)
-    given = samples, log_weights, offset, copies, factor
+    given = samples, log_weights, offset, order, copies, factor
     _resample_sessions(*(t.contiguous().numpy() for t in given))
     return copies, factor
 
 
 def compiled_poles(samples: Tensor, normal: Tensor, groups: int) -> Tensor:
-    """``resampling.poles_of`` from samples (S M D) and normal numbers (S V D): (V S P D)."""
-    n_sessions, n_moves, n_features = normal.shape
-    poles = samples.new_empty(n_moves, n_sessions, groups, n_features)
+    """``resampling.poles_of`` from samples (S M D) and normal numbers (S F V D): (V S PF D)."""
+    n_sessions, n_frames, n_moves, n_features = normal.shape
+    poles = samples.new_empty(n_moves, n_sessions, groups * n_frames, n_features)
     _aim_sessions(*(t.contiguous().numpy() for t in (samples, normal, poles)))
     return poles
 
@@ -47,7 +47,12 @@ def compiled_share(before: Tensor, after: Tensor) -> Tensor:
 
 @compiled
 def _resample_sessions(
-    samples: Array, log_weights: Array, offset: Array, copies: Array, factor: Array
+    samples: Array,
+    log_weights: Array,
+    offset: Array,
+    order: Array,
+    copies: Array,
+    factor: Array,
 ) -> None:
     """Fill ``copies`` (S M D) and ``factor`` (S)."""
     n_samples, n_features = samples.shape[1:]
@@ -65,7 +70,8 @@ def _resample_sessions(
                 m += 1
             chosen[i] = m
             multiplicity[m] += 1
-            copies[s, i] = samples[s, m]
+        for i in range(n_samples):
+            copies[s, i] = samples[s, chosen[order[i]]]
         mean = np.zeros(n_features)
         for i in range(n_samples):
             for d in range(n_features):
@@ -75,25 +81,27 @@ def _resample_sessions(
             distance = 0.0
             for d in range(n_features):
                 distance += (copies[s, i, d] - mean[d]) ** 2
-            weighted += multiplicity[chosen[i]] * distance
+            weighted += multiplicity[chosen[order[i]]] * distance
             whole += distance
         factor[s] = weighted / max(whole, 1e-30)
 
 
 @compiled
 def _aim_sessions(samples: Array, normal: Array, poles: Array) -> None:
-    """Fill ``poles`` (V S P D)."""
-    n_moves, _, n_groups, n_features = poles.shape
+    """Fill ``poles`` (V S PF D)."""
+    n_frames, n_moves, n_features = normal.shape[1:]
+    n_groups = poles.shape[2] // n_frames
     for s in range(len(samples)):
-        frames = _frames(normal[s])
         spread = _spread_of_others(samples[s], n_groups)
-        for v in range(n_moves):
-            for p in range(n_groups):
-                for d in range(n_features):
-                    ahead = 0.0
-                    for e in range(d + 1):
-                        ahead += spread[p, d, e] * frames[v, e]
-                    poles[v, s, p, d] = ahead
+        for f in range(n_frames):
+            frames = _frames(normal[s, f])
+            for v in range(n_moves):
+                for p in range(n_groups):
+                    for d in range(n_features):
+                        ahead = 0.0
+                        for e in range(d + 1):
+                            ahead += spread[p, d, e] * frames[v, e]
+                        poles[v, s, p * n_frames + f, d] = ahead
 
 
 @compiled

@@ -21,7 +21,7 @@ import torch
 from torch import Generator, Tensor
 from torch.nn import functional as F
 
-from torchrl_pref.resampling import explained_share, group_of, poles_of
+from torchrl_pref.resampling import FRAMES, explained_share, group_of, poles_of
 from torchrl_pref.responses import ResponseModel, compiled_constants
 from torchrl_pref.sampler_cpu import compiled_moves
 
@@ -77,7 +77,8 @@ def round_of_moves(
     """
     n_sessions, n_samples, n_features = samples.shape
     device = samples.device
-    normal = torch.randn((n_sessions, n_moves, n_features), generator=generator, device=device)
+    shape = (n_sessions, FRAMES, n_moves, n_features)
+    normal = torch.randn(shape, generator=generator, device=device)
     size = (n_moves, n_sessions, n_samples, 2 + MAX_SHRINKS)
     uniform = torch.rand(size, generator=generator, device=device)
     poles = poles_of(samples, normal)

@@ -169,7 +169,7 @@ def compare(case: Case, gaps: Tensor, exact: Posterior, sessions: int) -> Measur
         bias=bias,
         bias_error=math.sqrt(noise + 1 / exact.draws),
         variance=float(spread.mean()),
-        variance_error=math.sqrt(float(spread.var()) / sessions + 2 / exact.draws),
+        variance_error=math.sqrt(float(spread.var()) / sessions + exact.error**2),
         effective=total / float((means - mean).square().sum(-1).mean()),
         reported=float(1 / (1 / ess).mean()),
         milliseconds=1000 * seconds / sessions / max(1, len(gaps)),

@@ -38,6 +38,8 @@ class Posterior(NamedTuple):
     """(D D)."""
     draws: float
     """How many independent draws are as good for the mean, by Kish: its error is sd/√draws."""
+    error: float
+    """Standard error of the trace of the covariance, as a share of it."""
 
 
 def log_likelihood(omega: Array, gaps: Array, tau: float | None, tolerance: float = 1e-6) -> Array:
@@ -61,24 +63,19 @@ def posterior(
     """Moments of the posterior after answers with gaps (H K-1 D), the prior being uniform."""
     rng = np.random.default_rng(seed)
     if tau is None and gaps.shape[2] > 6:
-        return _walk(gaps, rng, chains=1000, steps=3000)
+        return _walk(gaps, rng, chains=1000, steps=9000)
     proposal = _adapt(gaps, tau, tolerance, rng)
-    totals, first, second, squares = 0.0, 0.0, 0.0, 0.0
-    highest = -np.inf
-    for _ in range(max(1, draws // 50_000)):
-        omega = proposal.draw(min(draws, 50_000), rng)
-        logs = log_likelihood(omega, gaps, tau, tolerance) - proposal.log_density(omega)
-        scale = max(highest, float(logs.max()))
-        if scale == -np.inf:
-            continue
-        weights, shrink = np.exp(logs - scale), np.exp(highest - scale)
-        totals = totals * shrink + weights.sum()
-        squares = squares * shrink**2 + np.square(weights).sum()
-        first = first * shrink + weights @ omega
-        second = second * shrink + (omega * weights[:, None]).T @ omega
-        highest = scale
-    mean = first / totals
-    return Posterior(mean, second / totals - np.outer(mean, mean), float(totals**2 / squares))
+    parts = [proposal.draw(50_000, rng) for _ in range(max(1, draws // 50_000))]
+    logs = np.concatenate(
+        [log_likelihood(p, gaps, tau, tolerance) - proposal.log_density(p) for p in parts]
+    )
+    omega, weights = np.concatenate(parts), np.exp(logs - logs.max())
+    weights /= weights.sum()
+    mean = weights @ omega
+    covariance = (omega * weights[:, None]).T @ omega - np.outer(mean, mean)
+    distance = np.square(omega - mean).sum(1) / np.trace(covariance)
+    error = math.sqrt(np.square(weights * (distance - 1)).sum())
+    return Posterior(mean, covariance, float(1 / np.square(weights).sum()), error)
 
 
 class _Component(NamedTuple):
@@ -141,8 +138,15 @@ class _Proposal:
         return np.logaddexp.reduce(logs)
 
     def fit(self, omega: Array, rng: np.random.Generator) -> None:
-        """Fit the components to points (N D): k-means, then place and spread of each cluster."""
-        centres = omega[rng.choice(len(omega), COMPONENTS, replace=False)]
+        """Fit the components to points (N D): k-means, then place and spread of each cluster.
+
+        Centres start far from each other, and a small cluster gets more than its share: a far mode
+        that holds one in a thousand makes up much of the variance.
+        """
+        centres = omega[:1]
+        while len(centres) < COMPONENTS:
+            distance = 1 - (omega @ centres.T).max(1)
+            centres = np.concatenate([centres, omega[[distance.argmax()]]])
         for _ in range(10):
             nearest = (omega @ centres.T).argmax(1)
             for c in range(COMPONENTS):
@@ -157,7 +161,7 @@ class _Proposal:
         for own in clusters:
             centre = own.sum(0) / max(1, len(own))
             length = np.linalg.norm(centre)
-            if len(np.unique(own, axis=0)) < 4 * self.n_features or length < 0.05:
+            if len(np.unique(own, axis=0)) < 2 * self.n_features or length < 0.05:
                 continue
             centre /= length
             basis = np.linalg.svd(np.eye(self.n_features) - np.outer(centre, centre))[0][:, :-1]
@@ -169,7 +173,7 @@ class _Proposal:
             for freedom, scale in ((1.0, 0.4), (10.0, 1.1)):
                 factor = np.linalg.cholesky(spread * scale)
                 self.components.append(_Component(centre, basis, plane.mean(0), factor, freedom))
-                shares.append(len(own))
+                shares.append(math.sqrt(len(own)))
         counts = np.array([0.0, *shares])
         if shares:
             counts *= (1 - UNIFORM) / counts.sum()
@@ -253,7 +257,8 @@ def _walk(gaps: Array, rng: np.random.Generator, chains: int, steps: int) -> Pos
     mean = first.mean(0)
     covariance = second - np.outer(mean, mean)
     between = np.square(first - mean).sum() / (chains - 1)
-    return Posterior(mean, covariance, float(np.trace(covariance) / between * chains))
+    size = float(np.trace(covariance) / between * chains)
+    return Posterior(mean, covariance, size, math.sqrt(2 / size))
 
 
 def _hit_and_run(omega: Array, rows: Array, rng: np.random.Generator) -> Array:

@@ -92,9 +92,9 @@ def test_effective_sample_size_is_what_it_says(
     queries = torch.randn(3, 2, 4, generator=generator)
     omega = uniform_sphere((4,), generator)
     answers = (queries @ omega).argmax(-1)
-    samples, ess = converse(Belief(model, moves=1), queries, answers, 400, generator)
+    samples, ess = converse(Belief(model, moves=2), queries, answers, 400, generator)
     true = samples.flatten(0, 1).var(0).sum() / samples.mean(1).var(0).sum()
-    assert float(true) < 70  # one move leaves copies close together: there is something to report
+    assert float(true) < 80  # two moves leave copies alike: there is something to report
     assert float(ess.mean()) == pytest.approx(float(true), rel=0.15)
     assert ((ess >= 1) & (ess <= 100)).all()
 

@@ -275,17 +275,19 @@ class Belief:
         return _furthest(
             power,
             torch.ones_like(power),
-            lambda to: kish_share((to - power).unsqueeze(1) * likelihood) >= RESTART_SHARE,
+            lambda to: kish_share((to - power).unsqueeze(-1) * likelihood) >= RESTART_SHARE,
         )
 
     def _log_raised(self, gaps: Tensor, slack: Tensor) -> Tensor:
-        """(S M), of one answer with gaps (S M K-1) raised by slack (S); infinite slack gives 0."""
-        raised = gaps + slack.nan_to_num(posinf=0.0)[:, None, None]
+        """(… S M), of one answer with gaps (S M K-1) raised by slack (… S); infinite slack gives
+        0."""
+        raised = gaps + slack.nan_to_num(posinf=0.0)[..., None, None]
         log_likelihood = self.response_model.log_likelihood(raised)
-        return log_likelihood.masked_fill(slack.isinf()[:, None], 0.0)
+        return log_likelihood.masked_fill(slack.isinf()[..., None], 0.0)
 
     def _log_weights(self, gaps: Tensor, slack: Tensor, log_now: Tensor) -> Tensor:
-        """(S M), of samples with log-likelihoods (S M) when an answer's slack becomes this (S)."""
+        """(… S M), of samples with log-likelihoods (S M) when an answer's slack becomes this
+        (… S)."""
         # By rounding a sample may lie just outside of where it was moved to, and is dropped.
         return self._log_raised(gaps, slack) - log_now.clamp(min=torch.finfo(log_now.dtype).min)
 
@@ -335,13 +337,19 @@ def _gaps(samples: Tensor, feature_gaps: Tensor) -> Tensor:
 
 
 def _furthest(start: Tensor, end: Tensor, fits: Callable[[Tensor], Tensor]) -> Tensor:
-    """(S), the end where it fits, else as near to it as fits: bisection from a start that fits."""
-    reached = fits(end)
+    """(S), the end where it fits, else as near to it as fits, from a start (S) that does.
+
+    ``fits`` takes places (P S) and says for each whether it fits. An interval is cut into 32 parts,
+    six times: for a few sessions that is five times as fast as to halve it thirty times.
+    """
+    share = torch.linspace(0, 1, 33, device=start.device)[:, None]
+    reached = fits(end[None])[0]
     if reached.all():
         return end
-    beyond = end
-    for _ in range(30):
-        middle = (start + beyond) / 2
-        enough = fits(middle)
-        start, beyond = torch.where(enough, middle, start), torch.where(enough, beyond, middle)
-    return torch.where(reached, end, start)
+    near, beyond = start, end
+    for _ in range(6):
+        places = torch.lerp(near, beyond, share)
+        # The first place fits, and the last does not.
+        n_fit = fits(places[1:-1]).cumprod(0).sum(0, keepdim=True)
+        near, beyond = places.gather(0, n_fit)[0], places.gather(0, n_fit + 1)[0]
+    return torch.where(reached, end, near)

@@ -1,40 +1,68 @@
-"""The machine code of compiled functions is kept where it can be."""
-
-from __future__ import annotations
+"""Loops over sessions in threads."""
 
 import os
-import subprocess
-import sys
-from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 
-FAR_FROM_HERE = """
-from torchrl_pref.compiled import compiled
-
-@compiled
-def double(x: float) -> float:
-    return 2.0 * x
-
-print(double(21.0))
-"""
+from torchrl_pref.acquisition import information_gain, score_queries
+from torchrl_pref.belief import Belief
+from torchrl_pref.compiled import FEWEST, over_sessions
+from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel
 
 
-@pytest.mark.parametrize("writable", [True, False], ids=["kept", "nowhere"])
-def test_a_tree_and_a_home_that_cannot_be_written(writable: bool, tmp_path: Path) -> None:
-    """A file where each cache folder would be stands for what may not be written: root may
-    write everywhere else."""
-    source = tmp_path / "double.py"
-    source.write_text(FAR_FROM_HERE)
-    if not writable:
-        (tmp_path / "__pycache__").write_text("")
-    file = tmp_path / "file"
-    file.write_text("")
-    places = {"NUMBA_CACHE_DIR": f"{file}/x", "XDG_CACHE_HOME": f"{file}/x", "HOME": f"{file}/x"}
-    environment = {**os.environ, **places, "PYTHONPATH": str(Path(__file__).parent.parent)}
-    done = subprocess.run(
-        [sys.executable, source], env=environment, capture_output=True, text=True, timeout=120
-    )
-    assert (done.stdout, done.returncode) == ("42.0\n", 0), done.stderr
-    kept = [path.name for path in tmp_path.rglob("double.double-*")]
-    assert bool(kept) == writable
+@pytest.mark.parametrize("threads", [1, 2, 5])
+@pytest.mark.parametrize("n_sessions", [0, 1, 2 * FEWEST, 7 * FEWEST + 3])
+def test_every_session_is_visited_once(
+    threads: int, n_sessions: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torchrl_pref.compiled.config.NUMBA_NUM_THREADS", threads)
+    visits = np.zeros(n_sessions)
+
+    def loop(first: int, last: int, visits: np.ndarray, by: float) -> None:
+        visits[first:last] += by
+
+    over_sessions(loop, n_sessions, visits, 2.0)
+    assert (visits == 2).all()
+
+
+def test_what_fails_in_a_thread_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torchrl_pref.compiled.config.NUMBA_NUM_THREADS", 2)
+
+    def loop(first: int, last: int) -> None:
+        if first > 0:
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        over_sessions(loop, 2 * FEWEST)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no forks here")
+def test_a_fork_has_threads_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torchrl_pref.compiled.config.NUMBA_NUM_THREADS", 2)
+    over_sessions(lambda first, last: None, 2 * FEWEST)
+    child = os.fork()
+    if child == 0:
+        over_sessions(lambda first, last: None, 2 * FEWEST)  # without threads it waits for ever
+        os._exit(7)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
+
+
+@pytest.mark.parametrize("model", [Boltzmann(4.5), Optimal()], ids=str)
+def test_no_number_depends_on_the_threads(
+    model: ResponseModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def followed(threads: int) -> list[torch.Tensor]:
+        monkeypatch.setattr("torchrl_pref.compiled.config.NUMBA_NUM_THREADS", threads)
+        generator, belief = torch.Generator().manual_seed(0), Belief(model)
+        samples = belief.prior(5 * FEWEST, 3, generator)
+        gaps = torch.randn(5 * FEWEST, 1, 1, 3, generator=generator)
+        queries = torch.randn(5 * FEWEST, 4, 2, 3, generator=generator)
+        update = belief.update(
+            samples, torch.full((len(gaps),), 100.0), gaps[:, :0], gaps[:, 0], generator
+        )
+        return [*update, score_queries(update.samples, queries, model, information_gain)]
+
+    for one, three in zip(followed(1), followed(3), strict=True):
+        assert torch.equal(one, three)

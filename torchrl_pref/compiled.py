@@ -4,14 +4,21 @@ It is kept in ``NUMBA_CACHE_DIR`` where that is set, else in ``__pycache__`` bes
 in the user's cache; where none of these can be written, each process compiles anew. What is kept is
 made anew when its own file changes and not when another does: a compiled function calls only those
 of its own file.
+
+The two long loops over sessions, moves and scores, are shared out among threads, each of which
+takes some of the sessions: as many as ``NUMBA_NUM_THREADS``, by default one for each core. No
+number depends on how many there are.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
-from typing import TypeVar
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from typing import Any, TypeVar
 
-from numba import njit
+from numba import config, njit
 
 R = TypeVar("R")
 
@@ -25,3 +32,33 @@ def compiled(function: Callable[..., R]) -> Callable[..., R]:
         return njit(cache=True, **OPTIONS)(function)
     except RuntimeError:  # no place for the cache can be written
         return njit(**OPTIONS)(function)
+
+
+FEWEST = 16
+"""Sessions that a thread is worth."""
+
+
+def over_sessions(loop: Callable[..., None], n_sessions: int, *arguments: Any) -> None:
+    """Run a compiled loop over sessions, in threads where there are many.
+
+    Args:
+        loop: of the first session, the one after the last, and the arguments; it writes into them.
+        n_sessions: how many there are.
+        arguments: as many as the loop takes.
+    """
+    parts = max(1, min(config.NUMBA_NUM_THREADS, n_sessions // FEWEST))
+    ends = [part * n_sessions // parts for part in range(parts + 1)]
+    others = [_threads().submit(loop, *ends[p : p + 2], *arguments) for p in range(1, parts)]
+    loop(0, ends[1], *arguments)
+    for other in others:
+        other.result()
+
+
+@lru_cache(maxsize=1)
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(config.NUMBA_NUM_THREADS, "over_sessions")
+
+
+# A fork has none of the threads of the process that it comes from.
+if hasattr(os, "register_at_fork"):  # not on Windows
+    os.register_at_fork(after_in_child=_threads.cache_clear)

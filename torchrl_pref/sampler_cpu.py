@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_pref.compiled import compiled
+from torchrl_pref.compiled import compiled, over_sessions
 
 Array = np.ndarray[Any, np.dtype[Any]]
 
@@ -53,12 +53,15 @@ def compiled_moves(
     """
     moved = torch.empty_like(samples, memory_format=torch.contiguous_format)
     given = samples, poles, uniform, answers, slack, power, moved
-    _move_sessions(*(t.contiguous().numpy() for t in given), arc, tau, tolerance)
+    arrays = (t.contiguous().numpy() for t in given)
+    over_sessions(_move_sessions, len(samples), *arrays, arc, tau, tolerance)
     return moved
 
 
 @compiled
 def _move_sessions(
+    first: int,
+    last: int,
     samples: Array,
     poles: Array,
     uniform: Array,
@@ -72,7 +75,7 @@ def _move_sessions(
 ) -> None:
     """Fill ``moved`` (S M D)."""
     n_others, hard = answers.shape[2], math.isinf(tau)
-    for s in range(len(samples)):
+    for s in range(first, last):
         rows, raised = _rows_of(answers[s], slack[s], 1.0 if hard else tau)
         given = rows, raised, float(power[s]), arc, n_others, hard, tolerance
         _move_session(samples[s], poles[:, s], uniform[:, s], moved[s], *given)

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from torchrl_pref.compiled import compiled
+from torchrl_pref.compiled import compiled, over_sessions
 
 Array = np.ndarray[Any, np.dtype[Any]]
 
@@ -50,17 +50,23 @@ def compiled_scores(samples: Tensor, queries: Tensor, tau: float, tolerance: flo
     scores = samples.new_empty(*queries.shape[:2], 3)
     shared = queries[:1] if queries.stride(0) == 0 else queries
     arrays = [t.detach().contiguous().numpy() for t in (samples, shared, scores)]
-    _score_sessions(*arrays, tau, tolerance)
+    over_sessions(_score_sessions, len(samples), *arrays, tau, tolerance)
     scores[..., 0].clamp_(0, math.log2(queries.shape[2]))
     return scores
 
 
 @compiled
 def _score_sessions(
-    samples: Array, queries: Array, scores: Array, tau: float, tolerance: float
+    first: int,
+    last: int,
+    samples: Array,
+    queries: Array,
+    scores: Array,
+    tau: float,
+    tolerance: float,
 ) -> None:
     """Fill ``scores`` (S C 3); there are queries (1 C K D) for all or (S C K D) for each."""
-    n_sessions, n_samples, n_features = samples.shape
+    n_samples, n_features = samples.shape[1:]
     n_options = queries.shape[2]
     hard = math.isinf(tau)
     unit = 1.0 if hard else tau  # leads are in units of 1/tau
@@ -71,7 +77,7 @@ def _score_sessions(
     probs = np.empty((n_options, n_samples), np.float32)
     scratch = np.empty((3, n_samples), np.float32)
     sums, left = np.empty(n_options), np.empty(len(centred))
-    for s in range(n_sessions):
+    for s in range(first, last):
         for d in range(n_features):
             mean[d] = 0.0
             for m in range(n_samples):

@@ -34,7 +34,7 @@ def compiled(function: Callable[..., R]) -> Callable[..., R]:
         return njit(**OPTIONS)(function)
 
 
-FEWEST = 16
+FEWEST = 6
 """Sessions that a thread is worth."""
 
 

@@ -32,6 +32,7 @@ from benchmarks import common
 from tests.posterior import Posterior, posterior
 from torchrl_pref.acquisition import information_gain, score_queries
 from torchrl_pref.belief import Belief, feature_gaps, uniform_sphere
+from torchrl_pref.compiled import use_threads
 from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel
 
 BOUND = 0.02
@@ -133,6 +134,7 @@ def _worst(results: dict[Case, Measured]) -> Iterator[common.Row]:
 
 def _one_thread() -> None:
     torch.set_num_threads(1)
+    use_threads(1)
 
 
 def _is_beyond(measured: Measured) -> bool:

@@ -1,23 +1,31 @@
 """Loops over sessions in threads."""
 
 import os
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
 import torch
+from numba import config
 
 from torchrl_pref.acquisition import information_gain, score_queries
 from torchrl_pref.belief import Belief
-from torchrl_pref.compiled import FEWEST, over_sessions
+from torchrl_pref.compiled import FEWEST, over_sessions, use_threads
 from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel
+
+
+@pytest.fixture
+def threads_back() -> Iterator[None]:
+    """As many threads after the test as before."""
+    before = config.NUMBA_NUM_THREADS
+    yield
+    use_threads(before)
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
 @pytest.mark.parametrize("n_sessions", [0, 1, 2 * FEWEST, 7 * FEWEST + 3])
-def test_every_session_is_visited_once(
-    threads: int, n_sessions: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("torchrl_pref.compiled.config.NUMBA_NUM_THREADS", threads)
+def test_every_session_is_visited_once(threads: int, n_sessions: int, threads_back: None) -> None:
+    use_threads(threads)
     visits = np.zeros(n_sessions)
 
     def loop(first: int, last: int, visits: np.ndarray, by: float) -> None:
@@ -27,8 +35,8 @@ def test_every_session_is_visited_once(
     assert (visits == 2).all()
 
 
-def test_what_fails_in_a_thread_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("torchrl_pref.compiled.config.NUMBA_NUM_THREADS", 2)
+def test_what_fails_in_a_thread_is_told(threads_back: None) -> None:
+    use_threads(2)
 
     def loop(first: int, last: int) -> None:
         if first > 0:
@@ -39,8 +47,8 @@ def test_what_fails_in_a_thread_is_told(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no forks here")
-def test_a_fork_has_threads_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("torchrl_pref.compiled.config.NUMBA_NUM_THREADS", 2)
+def test_a_fork_has_threads_of_its_own(threads_back: None) -> None:
+    use_threads(2)
     over_sessions(lambda first, last: None, 2 * FEWEST)
     child = os.fork()
     if child == 0:
@@ -50,11 +58,9 @@ def test_a_fork_has_threads_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("model", [Boltzmann(4.5), Optimal()], ids=str)
-def test_no_number_depends_on_the_threads(
-    model: ResponseModel, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_number_depends_on_the_threads(model: ResponseModel, threads_back: None) -> None:
     def followed(threads: int) -> list[torch.Tensor]:
-        monkeypatch.setattr("torchrl_pref.compiled.config.NUMBA_NUM_THREADS", threads)
+        use_threads(threads)
         generator, belief = torch.Generator().manual_seed(0), Belief(model)
         samples = belief.prior(5 * FEWEST, 3, generator)
         gaps = torch.randn(5 * FEWEST, 1, 1, 3, generator=generator)

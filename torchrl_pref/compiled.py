@@ -54,9 +54,14 @@ def over_sessions(loop: Callable[..., None], n_sessions: int, *arguments: Any) -
         other.result()
 
 
+def use_threads(count: int) -> None:
+    """Share loops out among so many threads from now on, in this process."""
+    config.NUMBA_NUM_THREADS = count
+
+
 @lru_cache(maxsize=1)
 def _threads() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(config.NUMBA_NUM_THREADS, "over_sessions")
+    return ThreadPoolExecutor(thread_name_prefix="over_sessions")
 
 
 # A fork has none of the threads of the process that it comes from.

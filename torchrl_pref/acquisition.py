@@ -145,7 +145,9 @@ def score_queries(
         return score_in_tensors(samples, queries, response_model, acquisition)
     scores = compiled_scores(samples, queries, *constants)
     columns = [COMPILED.index(each) for each in functions]
-    return scores[..., columns] if several else scores[..., columns[0]]
+    if not several:
+        return scores[..., columns[0]]
+    return scores if columns == [0, 1, 2] else scores[..., columns]
 
 
 def _is_plain(numbers: Tensor) -> bool:

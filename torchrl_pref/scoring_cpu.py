@@ -51,7 +51,6 @@ def compiled_scores(samples: Tensor, queries: Tensor, tau: float, tolerance: flo
     shared = queries[:1] if queries.stride(0) == 0 else queries
     arrays = [t.detach().contiguous().numpy() for t in (samples, shared, scores)]
     over_sessions(_score_sessions, len(samples), *arrays, tau, tolerance)
-    scores[..., 0].clamp_(0, math.log2(queries.shape[2]))
     return scores
 
 
@@ -283,7 +282,8 @@ def _gains(
     for d in range(len(centred)):
         length += left[d] * left[d]
     gain += length / max(sums[likely], 1e-30)
-    return entropy - bits / n_samples, gain / n_samples, 1.0 - squares
+    gained = min(max(entropy - bits / n_samples, 0.0), math.log2(n_options))  # but for rounding
+    return gained, gain / n_samples, 1.0 - squares
 
 
 @compiled

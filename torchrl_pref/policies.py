@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
-    TensorDictModule,
     TensorDictModuleBase,
     TensorDictSequential,
 )
@@ -65,6 +66,30 @@ class Policy:
         return nn.ModuleDict({"actor": self.actor, "critic": self.critic})
 
 
+class Layer(TensorDictModuleBase):
+    """A module from tensors to tensors, read from a tensordict and written into it.
+
+    TensorDictModule also takes what is no tensor, which costs it a search of the disk for h5py each
+    time: a tenth of a step of one session.
+
+    Args:
+        module: what it gives is one tensor for each of ``out_keys``.
+        in_keys, out_keys: names of its inputs and outputs.
+    """
+
+    def __init__(self, module: Callable[..., Any], in_keys: list[str], out_keys: list[str]) -> None:
+        super().__init__()
+        self.module, self.in_keys, self.out_keys = module, in_keys, out_keys
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Read, compute, write."""
+        values = self.module(*(tensordict.get(key) for key in self.in_keys))
+        values = (values,) if len(self.out_keys) == 1 else values
+        for key, value in zip(self.out_keys, values, strict=True):
+            tensordict.set(key, value)
+        return tensordict
+
+
 def scorer_policy(env: QueryEnv | FeedEnv, start: str | None = None) -> Policy:
     """The default policy: a shared network scores each candidate, so any pool of any size will do.
 
@@ -79,7 +104,7 @@ def scorer_policy(env: QueryEnv | FeedEnv, start: str | None = None) -> Policy:
     device = torch.device(env.device)
     n_shares = env.observation_spec["remaining"].shape[-1]
     if isinstance(env, QueryEnv):
-        features = TensorDictModule(
+        features = Layer(
             CandidateFeatures(env.belief.response_model),
             in_keys=["samples", "queries"],
             out_keys=["candidate_features"],
@@ -92,13 +117,13 @@ def scorer_policy(env: QueryEnv | FeedEnv, start: str | None = None) -> Policy:
                 f"policy.start={start}: in the feed the scorer starts from the quantile rule; "
                 "leave policy.start out, or set setup=query"
             )
-        features = TensorDictModule(
+        features = Layer(
             OfferFeatures(env),
             in_keys=["samples", "offer", "n_asked", "n_offered"],
             out_keys=["offer_features", "rank", "share", "urgency"],
         )
         network = OfferScorer(n_shares, device)
-    logits = TensorDictModule(
+    logits = Layer(
         network, in_keys=[*features.out_keys, "belief_features"], out_keys=["logits"]
     )
     observe = TensorDictSequential(features, _belief_features(PerBelief(belief_summary)))
@@ -122,14 +147,14 @@ def attention_policy(env: QueryEnv | FeedEnv, tokens: str = "samples") -> Policy
         (AttentionScorer, "queries") if isinstance(env, QueryEnv) else (OfferAttention, "offer")
     )
     network = kind(env.features.shape[-1], n_shares, tokens, device)
-    logits = TensorDictModule(network, in_keys=["samples", shown, "remaining"], out_keys=["logits"])
+    logits = Layer(network, in_keys=["samples", shown, "remaining"], out_keys=["logits"])
     observe = _belief_features(PerBelief(belief_summary))
     return Policy(observe, _actor(logits, env), _belief_critic(n_shares, device))
 
 
-def _belief_features(summary: Callable[[Tensor], Tensor]) -> TensorDictModule:
+def _belief_features(summary: Callable[[Tensor], Tensor]) -> Layer:
     """What the critic reads of the belief."""
-    return TensorDictModule(
+    return Layer(
         BeliefFeatures(summary), in_keys=["samples", "remaining"], out_keys=["belief_features"]
     )
 
@@ -162,19 +187,19 @@ def paper_policy(env: QueryEnv | FeedEnv) -> Policy:
     if isinstance(env, FeedEnv):
         size += env.features[0].numel()
         state_keys = ["mean", "flat_offer"]
-        observe = TensorDictModule(
+        observe = Layer(
             lambda offer: offer.flatten(-2), in_keys=["offer"], out_keys=["flat_offer"]
         )
     cells = {"num_cells": [64, 64], "activation_class": nn.Tanh, "device": device}
     network = MLP(size, env.action_spec.space.n, **cells)
-    logits = TensorDictModule(network, in_keys=state_keys, out_keys=["logits"])
+    logits = Layer(network, in_keys=state_keys, out_keys=["logits"])
     critic: TensorDictModuleBase = ValueOperator(MLP(size, 1, **cells), in_keys=state_keys)
     if observe is not None:
         critic = TensorDictSequential(observe, critic)
     return Policy(observe, _actor(logits, env), critic)
 
 
-def _actor(logits: TensorDictModule, env: QueryEnv | FeedEnv) -> ProbabilisticActor:
+def _actor(logits: Layer, env: QueryEnv | FeedEnv) -> ProbabilisticActor:
     """A categorical actor, masked where the environment says what may be asked."""
     masked = isinstance(env, QueryEnv)
     return ProbabilisticActor(

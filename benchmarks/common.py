@@ -20,7 +20,7 @@ import torch
 from tabulate import tabulate
 
 from torchrl_pref.belief import uniform_sphere
-from torchrl_pref.compiled import use_threads
+from torchrl_pref.compiled import share_out
 from torchrl_pref.features import Normalizer
 from torchrl_pref.queries import QueryPool, gridworld_pool
 
@@ -41,7 +41,7 @@ def arguments(description: str | None) -> argparse.ArgumentParser:
 def start(parser: argparse.ArgumentParser) -> argparse.Namespace:
     """Read the command line and set torch to one thread."""
     torch.set_num_threads(1)
-    use_threads(1)
+    share_out(1)
     return parser.parse_args()
 
 

@@ -32,7 +32,7 @@ from benchmarks import common
 from tests.posterior import Posterior, posterior
 from torchrl_pref.acquisition import information_gain, score_queries
 from torchrl_pref.belief import Belief, feature_gaps, uniform_sphere
-from torchrl_pref.compiled import use_threads
+from torchrl_pref.compiled import share_out
 from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel
 
 BOUND = 0.02
@@ -84,16 +84,18 @@ def main() -> None:
     parser = common.arguments(__doc__)
     parser.add_argument("--sessions", type=int, default=200, help="beliefs a case (default 200)")
     parser.add_argument("--features", default="2,4,6,8,16", help="numbers of features D")
+    parser.add_argument("--options", default="2,3,5", help="numbers of options K")
     parser.add_argument("--csv", type=Path, help="also write every case to this file")
     parser.add_argument("--workers", type=int, default=2, help="processes (default 2)")
     options = common.start(parser)
     sizes = [int(size) for size in options.features.split(",")]
-    cases = [Case(*case) for case in product(sizes, (2, 3, 5), (0.5, 4.5, 30.0, None), KINDS)]
+    options_of = [int(number) for number in options.options.split(",")]
+    cases = [Case(*case) for case in product(sizes, options_of, (0.5, 4.5, 30.0, None), KINDS)]
     with ProcessPoolExecutor(options.workers, get_context("spawn"), _one_thread) as executor:
         jobs = executor.map(measure, cases, [options.sessions] * len(cases))
         done = zip(cases, tqdm(jobs, total=len(cases), unit="case"), strict=True)
         results = dict(done if options.csv is None else _written(done, options.csv))
-    common.report("Worst of the cases, K = 2, 3, 5", list(_worst(results)), options.json)
+    common.report(f"Worst of the cases, K = {options.options}", list(_worst(results)), options.json)
     beyond = [
         {**case._asdict(), **measured._asdict()}
         for case, measured in results.items()
@@ -134,7 +136,7 @@ def _worst(results: dict[Case, Measured]) -> Iterator[common.Row]:
 
 def _one_thread() -> None:
     torch.set_num_threads(1)
-    use_threads(1)
+    share_out(1)
 
 
 def _is_beyond(measured: Measured) -> bool:

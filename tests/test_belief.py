@@ -1,4 +1,5 @@
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -7,7 +8,8 @@ from posterior import posterior
 from torch import Generator, Tensor
 
 from benchmarks.posterior import Case, compare, history
-from torchrl_pref.belief import Belief, feature_gaps, uniform_sphere
+from torchrl_pref.belief import RESTART_SHARE, Belief, feature_gaps, uniform_sphere
+from torchrl_pref.resampling import kish_share
 from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel
 
 
@@ -220,6 +222,53 @@ def test_soft_answers_are_never_left_out(generator: Generator) -> None:
         )
         assert used.all()
     assert samples.isfinite().all()
+
+
+@pytest.mark.parametrize("tau", [0.5, 4.5])
+@pytest.mark.parametrize("n_options", [2, 3, 12])
+def test_ordinary_answers_are_no_surprise(
+    n_options: int, tau: float, generator: Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of twelve options each may be unlikely; the rarer a new beginning, the better the belief."""
+    begun: list[int] = []
+    begin_anew = Belief._begin_anew
+
+    def counted(belief: Belief, samples: Tensor, *rest: Any) -> Any:
+        begun.append(len(samples))
+        return begin_anew(belief, samples, *rest)
+
+    monkeypatch.setattr(Belief, "_begin_anew", counted)
+    model, sessions = Boltzmann(tau), 300
+    belief = Belief(model)
+    omega = uniform_sphere((sessions, 4, 1), generator)
+    samples, ess = belief.prior(sessions, 4, generator), torch.full((sessions,), 100.0)
+    gaps = torch.zeros(sessions, 0, n_options - 1, 4)
+    for _ in range(4):
+        queries = torch.randn(sessions, n_options, 4, generator=generator)
+        answers = model((queries @ omega).squeeze(-1)).exp().multinomial(1, generator=generator)
+        newest = feature_gaps(queries, answers.squeeze(-1))
+        samples, ess, _ = belief.update(samples, ess, gaps, newest, generator)
+        gaps = torch.cat([gaps, newest.unsqueeze(1)], 1)
+    assert sum(begun) < 0.1 * 4 * sessions
+
+
+def test_ties_are_no_surprise_to_a_human_who_never_errs(generator: Generator) -> None:
+    """Of twelve alike each has a twelfth, and what was answered before still holds."""
+    model, sessions = Optimal(), 20
+    queries = torch.zeros(2, 12, 3)
+    queries[0] = torch.randn(12, 3, generator=generator)
+    samples, ess = converse(Belief(model), queries, torch.tensor([3, 5]), sessions, generator)
+    gaps = feature_gaps(queries[:1], torch.tensor([3]))[0]
+    assert (samples @ gaps.T >= -1e-5).all()
+    assert all(len(session.unique(dim=0)) > 90 for session in samples)
+    assert (ess > 60).all()
+
+
+def test_however_sharp_the_likelihood_a_stage_keeps_enough(generator: Generator) -> None:
+    likelihood = -1e13 * torch.rand(40, 100, generator=generator)
+    power = Belief(Boltzmann(4.5))._next_power(likelihood, torch.zeros(40))
+    assert (power > 0).all()
+    assert (kish_share(power.unsqueeze(1) * likelihood) > RESTART_SHARE - 0.01).all()
 
 
 def test_narrow_posteriors_are_still_explored(generator: Generator) -> None:

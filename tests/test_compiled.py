@@ -1,6 +1,8 @@
 """Loops over sessions in threads."""
 
 import os
+import signal
+import time
 from collections.abc import Iterator
 
 import numpy as np
@@ -10,22 +12,21 @@ from numba import config
 
 from torchrl_pref.acquisition import information_gain, score_queries
 from torchrl_pref.belief import Belief
-from torchrl_pref.compiled import FEWEST, over_sessions, use_threads
+from torchrl_pref.compiled import FEWEST, over_sessions, share_out
 from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel
 
 
 @pytest.fixture
 def threads_back() -> Iterator[None]:
     """As many threads after the test as before."""
-    before = config.NUMBA_NUM_THREADS
     yield
-    use_threads(before)
+    share_out(config.NUMBA_NUM_THREADS)
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
 @pytest.mark.parametrize("n_sessions", [0, 1, 2 * FEWEST, 7 * FEWEST + 3])
 def test_every_session_is_visited_once(threads: int, n_sessions: int, threads_back: None) -> None:
-    use_threads(threads)
+    share_out(threads)
     visits = np.zeros(n_sessions)
 
     def loop(first: int, last: int, visits: np.ndarray, by: float) -> None:
@@ -36,7 +37,7 @@ def test_every_session_is_visited_once(threads: int, n_sessions: int, threads_ba
 
 
 def test_what_fails_in_a_thread_is_told(threads_back: None) -> None:
-    use_threads(2)
+    share_out(2)
 
     def loop(first: int, last: int) -> None:
         if first > 0:
@@ -46,21 +47,42 @@ def test_what_fails_in_a_thread_is_told(threads_back: None) -> None:
         over_sessions(loop, 2 * FEWEST)
 
 
+def test_when_the_first_part_fails_the_others_are_waited_for(threads_back: None) -> None:
+    share_out(2)
+    done: list[int] = []
+
+    def loop(first: int, last: int) -> None:
+        if first == 0:
+            raise ZeroDivisionError
+        time.sleep(0.05)
+        done.append(first)
+
+    with pytest.raises(ZeroDivisionError):
+        over_sessions(loop, 2 * FEWEST)
+    assert done == [FEWEST]
+
+
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no forks here")
+@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:DeprecationWarning")
 def test_a_fork_has_threads_of_its_own(threads_back: None) -> None:
-    use_threads(2)
+    share_out(2)
     over_sessions(lambda first, last: None, 2 * FEWEST)
     child = os.fork()
     if child == 0:
-        over_sessions(lambda first, last: None, 2 * FEWEST)  # without threads it waits for ever
-        os._exit(7)
+        status = 1
+        try:
+            signal.alarm(20)  # without threads of its own it would wait for ever
+            over_sessions(lambda first, last: None, 2 * FEWEST)
+            status = 7
+        finally:
+            os._exit(status)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
 
 
 @pytest.mark.parametrize("model", [Boltzmann(4.5), Optimal()], ids=str)
 def test_no_number_depends_on_the_threads(model: ResponseModel, threads_back: None) -> None:
     def followed(threads: int) -> list[torch.Tensor]:
-        use_threads(threads)
+        share_out(threads)
         generator, belief = torch.Generator().manual_seed(0), Belief(model)
         samples = belief.prior(5 * FEWEST, 3, generator)
         gaps = torch.randn(5 * FEWEST, 1, 1, 3, generator=generator)

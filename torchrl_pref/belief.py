@@ -33,8 +33,8 @@ MAX_STAGES = 12
 """Of one answer: twelve stages that keep a quarter each leave less than one in ten million."""
 
 SURPRISE = 0.1
-"""A soft answer that the belief held for less likely makes it begin anew. If the belief is right,
-that is rarer still."""
+"""A soft answer makes the belief begin anew where all answers that it held for no likelier had less
+than this probability together. If the belief is right, that is rarer still."""
 
 RESTART_SHARE, RESTART_STAGES = 0.5, 500
 """What each stage of a new beginning keeps, and how many stages there may be: it must find every
@@ -94,7 +94,8 @@ class Belief:
 
     Args:
         response_model: how the belief thinks the human answers. It may differ from how they do.
-        samples: M, at least 2.
+        samples: M, at least 2. With fewer than 20 each sample has too much of a say in where the
+            others move, and the spread comes out up to 3% too small.
         moves: Markov moves after each resampling, at least 1; None: as many as there are features
             (D²/8 beyond 8), and at least 4. They are repeated where the samples have not forgotten
             where they were.
@@ -168,9 +169,9 @@ class Belief:
         """:meth:`update` for as many sessions as are held in memory at once."""
         answers = torch.cat([earlier, newest.unsqueeze(1)], 1)
         foreseen = self.response_model.log_likelihood(_gaps(samples, newest))
-        # Where an answer can be impossible no power of its likelihood makes it less so.
-        possible = foreseen.isfinite().all(1)
-        surprised = possible & (foreseen.exp().mean(1) < SURPRISE)
+        surprised = foreseen.exp().mean(1) < SURPRISE
+        if surprised.any():
+            surprised[surprised.clone()] = self._surprised(samples[surprised], answers[surprised])
         few = ~surprised & (kish_share(foreseen) < MIN_SHARE)
         inflation = self.n_samples / ess
         plain = ~(surprised | few)
@@ -189,6 +190,18 @@ class Belief:
                         whole[who] = part
         moved, inflation, used = after
         return Update(moved, torch.where(used, self.n_samples / inflation, ess), used)
+
+    def _surprised(self, samples: Tensor, answers: Tensor) -> Tensor:
+        """(S), whether samples (S M D) held the last of the answers for too unlikely."""
+        gaps = _gaps(samples, answers)
+        # Of all options, less that of the one that was chosen.
+        returns = F.pad(-gaps[:, :, -1], (1, 0))
+        foreseen = self.response_model(returns).exp().mean(1)
+        no_likelier = foreseen <= foreseen[:, :1] * (1 + 1e-5)
+        surprised = (foreseen * no_likelier).sum(1) < SURPRISE
+        # Where an answer can be impossible no power of its likelihood makes it less so.
+        opposite = self.response_model.joint_log_likelihood(-gaps)
+        return surprised & opposite.isfinite().all(1)
 
     def _let_in(
         self, samples: Tensor, inflation: Tensor, answers: Tensor, generator: Generator
@@ -251,7 +264,7 @@ class Belief:
             Samples (S M D), inflation (S), and that the answer was used (S).
         """
         model = self.response_model
-        samples = self.prior(len(samples), samples.shape[2], generator)
+        samples = self.prior(len(samples), samples.shape[2], generator).to(samples)
         inflation, power = torch.ones_like(inflation), torch.zeros_like(inflation)
         todo = torch.arange(len(samples), device=samples.device)
         for stage in range(RESTART_STAGES):
@@ -272,8 +285,10 @@ class Belief:
 
     def _next_power(self, likelihood: Tensor, power: Tensor) -> Tensor:
         """(S), the largest power of the likelihood (S M) that keeps enough samples effective."""
+        # By this much no weight becomes more than twice another.
+        spread = (likelihood.amax(1) - likelihood.amin(1)).clamp(min=1e-20)
         return _furthest(
-            power,
+            (power + math.log(2) / spread).clamp(max=1),
             torch.ones_like(power),
             lambda to: kish_share((to - power).unsqueeze(-1) * likelihood) >= RESTART_SHARE,
         )
@@ -339,15 +354,16 @@ def _gaps(samples: Tensor, feature_gaps: Tensor) -> Tensor:
 def _furthest(start: Tensor, end: Tensor, fits: Callable[[Tensor], Tensor]) -> Tensor:
     """(S), the end where it fits, else as near to it as fits, from a start (S) that does.
 
-    ``fits`` takes places (P S) and says for each whether it fits. An interval is cut into 32 parts,
-    six times: for a few sessions that is five times as fast as to halve it thirty times.
+    ``fits`` takes places (P S) and says for each whether it fits. Thirty times an interval is
+    halved; for a few sessions it is faster to cut it into 32 parts, six times.
     """
-    share = torch.linspace(0, 1, 33, device=start.device)[:, None]
     reached = fits(end[None])[0]
     if reached.all():
         return end
+    parts, times = (32, 6) if len(start) <= 32 else (2, 30)
+    share = torch.linspace(0, 1, parts + 1, device=start.device)[:, None]
     near, beyond = start, end
-    for _ in range(6):
+    for _ in range(times):
         places = torch.lerp(near, beyond, share)
         # The first place fits, and the last does not.
         n_fit = fits(places[1:-1]).cumprod(0).sum(0, keepdim=True)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import lru_cache
 from typing import Any, TypeVar
 
@@ -37,6 +37,16 @@ def compiled(function: Callable[..., R]) -> Callable[..., R]:
 FEWEST = 6
 """Sessions that a thread is worth."""
 
+_threads = config.NUMBA_NUM_THREADS
+"""Numba's own may be set again at any compilation."""
+
+
+def share_out(threads: int) -> None:
+    """From now on, in this process, share long loops out among so many threads."""
+    global _threads
+    _threads = threads
+    _executor.cache_clear()
+
 
 def over_sessions(loop: Callable[..., None], n_sessions: int, *arguments: Any) -> None:
     """Run a compiled loop over sessions, in threads where there are many.
@@ -44,26 +54,24 @@ def over_sessions(loop: Callable[..., None], n_sessions: int, *arguments: Any) -
     Args:
         loop: of the first session, the one after the last, and the arguments; it writes into them.
         n_sessions: how many there are.
-        arguments: as many as the loop takes.
+        arguments: what else the loop takes.
     """
-    parts = max(1, min(config.NUMBA_NUM_THREADS, n_sessions // FEWEST))
+    parts = max(1, min(_threads, n_sessions // FEWEST))
     ends = [part * n_sessions // parts for part in range(parts + 1)]
-    others = [_threads().submit(loop, *ends[p : p + 2], *arguments) for p in range(1, parts)]
-    loop(0, ends[1], *arguments)
+    others = [_executor().submit(loop, *ends[p : p + 2], *arguments) for p in range(1, parts)]
+    try:
+        loop(0, ends[1], *arguments)
+    finally:  # no thread writes on once this has ended, however it does
+        wait(others)
     for other in others:
         other.result()
 
 
-def use_threads(count: int) -> None:
-    """Share loops out among so many threads from now on, in this process."""
-    config.NUMBA_NUM_THREADS = count
-
-
 @lru_cache(maxsize=1)
-def _threads() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(thread_name_prefix="over_sessions")
+def _executor() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(_threads, "over_sessions")
 
 
-# A fork has none of the threads of the process that it comes from.
 if hasattr(os, "register_at_fork"):  # not on Windows
-    os.register_at_fork(after_in_child=_threads.cache_clear)
+    # A fork has none of the threads of the process that it comes from.
+    os.register_at_fork(after_in_child=_executor.cache_clear)

@@ -27,7 +27,7 @@ from tqdm import tqdm
 from torchrl_pref.acquisition import alignment_gain, information_gain, volume_removal
 from torchrl_pref.checkpoint import Checkpoint
 from torchrl_pref.comparison import FIRST_EVALUATION_SEED
-from torchrl_pref.compiled import use_threads
+from torchrl_pref.compiled import share_out
 from torchrl_pref.envs import FeedEnv, QueryEnv
 from torchrl_pref.errors import InputError
 from torchrl_pref.evaluation import Evaluation, draw_humans, evaluate
@@ -165,7 +165,7 @@ def run_protocol(
 def _start_worker() -> None:
     """One thread for each worker, and tensors passed as files."""
     torch.set_num_threads(1)
-    use_threads(1)
+    share_out(1)
     torch.multiprocessing.set_sharing_strategy("file_system")
 
 

@@ -123,9 +123,7 @@ def scorer_policy(env: QueryEnv | FeedEnv, start: str | None = None) -> Policy:
             out_keys=["offer_features", "rank", "share", "urgency"],
         )
         network = OfferScorer(n_shares, device)
-    logits = Layer(
-        network, in_keys=[*features.out_keys, "belief_features"], out_keys=["logits"]
-    )
+    logits = Layer(network, in_keys=[*features.out_keys, "belief_features"], out_keys=["logits"])
     observe = TensorDictSequential(features, _belief_features(PerBelief(belief_summary)))
     return Policy(observe, _actor(logits, env), _belief_critic(n_shares, device))
 
@@ -187,9 +185,7 @@ def paper_policy(env: QueryEnv | FeedEnv) -> Policy:
     if isinstance(env, FeedEnv):
         size += env.features[0].numel()
         state_keys = ["mean", "flat_offer"]
-        observe = Layer(
-            lambda offer: offer.flatten(-2), in_keys=["offer"], out_keys=["flat_offer"]
-        )
+        observe = Layer(lambda offer: offer.flatten(-2), in_keys=["offer"], out_keys=["flat_offer"])
     cells = {"num_cells": [64, 64], "activation_class": nn.Tanh, "device": device}
     network = MLP(size, env.action_spec.space.n, **cells)
     logits = Layer(network, in_keys=state_keys, out_keys=["logits"])

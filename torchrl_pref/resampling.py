@@ -37,8 +37,8 @@ def resample(samples: Tensor, log_weights: Tensor, generator: Generator) -> tupl
         generator: the source of randomness, on the device of the samples.
 
     Returns:
-        Samples (S M D), copies of one within a group and with directions of their own, and by what
-        this multiplies the variance of their mean (S).
+        Samples (S M D) and by what this multiplies the variance of their mean (S). Copies of one
+        are in one group, unless they are at its border, and in turn in its sets of directions.
     """
     offset = torch.rand(len(samples), generator=generator, device=samples.device)
     order = _order(samples.shape[1], samples.device)
@@ -50,11 +50,15 @@ def resample(samples: Tensor, log_weights: Tensor, generator: Generator) -> tupl
 @lru_cache(maxsize=16)
 def _order(n_samples: int, device: torch.device) -> Tensor:
     """(M), which of the copies in a row goes to each place: those that a group gets are dealt to
-    its sets of directions."""
+    its sets of directions, as many to each as it has places for."""
+    sets = group_of(n_samples, min(GROUPS, n_samples) * FRAMES, device)
     places = torch.arange(n_samples, device=device)
-    group = group_of(n_samples, min(GROUPS, n_samples), device)
-    turn = places - torch.searchsorted(group, group)
-    return torch.argsort(group * FRAMES + turn % FRAMES, stable=True)
+    first = torch.searchsorted(sets, sets)
+    size = torch.searchsorted(sets, sets, right=True) - first
+    # The copies of a group fill its sets at an even pace, so that neighbours go to different ones.
+    pace = (places - first + 0.5) / size
+    dealt = torch.argsort(sets // FRAMES + pace + 1e-3 * (sets % FRAMES))
+    return torch.argsort(dealt)
 
 
 def tensor_resample(

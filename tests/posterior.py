@@ -3,10 +3,10 @@
 Shapes: H answers, K options per query, D features, N draws, C components of the proposal.
 
 The proposal is adapted to a tempered posterior step by step (population Monte Carlo; Cappé,
-Guillin, Marin and Robert, 2004): a mixture of the uniform distribution and of angular central
-Gaussians (Tyler, 1987), whose density on the sphere is known in closed form. Whatever it adapts to,
-the weights correct: a mode that it missed shows as a small effective number of draws, as a share
-of the draws is uniform.
+Guillin, Marin and Robert, 2004): a mixture of the uniform distribution and of Student t
+distributions on planes that touch the sphere. Whatever it adapts to, the weights correct; a share
+of the draws is uniform, so that in few dimensions a mode that it missed shows as a small effective
+number of draws.
 """
 
 from __future__ import annotations
@@ -233,7 +233,8 @@ def _walk(gaps: Array, rng: np.random.Generator, chains: int, steps: int) -> Pos
 
     In many dimensions it holds too little of any simple proposal. A great circle through a point of
     the cone is inside it on one arc, known in closed form, and uniform on it is invariant. Ties are
-    left out: where as much is tied as is not, but no better, they change nothing.
+    left out: what lies within the tolerance of a border weighs half, on either side of it, which is
+    to first order as if there were none.
 
     Args:
         gaps: (H K-1 D).

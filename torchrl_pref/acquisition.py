@@ -138,14 +138,13 @@ def score_queries(
         (B C …).
     """
     constants = compiled_constants(response_model)
-    several = isinstance(acquisition, Together)
     functions = acquisition.functions if isinstance(acquisition, Together) else (acquisition,)
     known = all(each in COMPILED for each in functions)
     if constants is None or not known or not (_is_plain(samples) and _is_plain(queries)):
         return score_in_tensors(samples, queries, response_model, acquisition)
     scores = compiled_scores(samples, queries, *constants)
     columns = [COMPILED.index(each) for each in functions]
-    if not several:
+    if not isinstance(acquisition, Together):
         return scores[..., columns[0]]
     return scores if columns == [0, 1, 2] else scores[..., columns]
 

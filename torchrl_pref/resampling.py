@@ -140,9 +140,8 @@ def poles_of(samples: Tensor, normal: Tensor) -> Tensor:
     """Directions of moves, from the spread of samples (S M D) and normal numbers (S F V D).
 
     Returns:
-        (V S P D), each as long as a Gaussian with the covariance of the samples outside the group
-        is wide in that direction. There are F poles for each of the :data:`GROUPS`, and so here P
-        is F times as many.
+        (V S PF D), each as long as a Gaussian with the covariance of the samples outside the group
+        is wide in that direction.
     """
     if samples.is_cpu:
         return compiled_poles(samples, normal, min(GROUPS, samples.shape[1]))

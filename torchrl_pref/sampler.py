@@ -1,7 +1,7 @@
 """The Markov moves of the belief: slice sampling on the unit sphere along great circles.
 
-Shapes: S sessions, M samples, H answers, K options per query, D features, V moves, P groups of
-samples, U uniforms of a move.
+Shapes: S sessions, M samples, H answers, K options per query, D features, V moves, P sets of
+samples that share a pole, U uniforms of a move.
 
 A slice sampler (Neal, 2003) restricted to a great circle through the current point (Habeck,
 Hasenpflug, Kodgirwar and Rudolf, *Geodesic slice sampling on the sphere*, 2023). It has no step

@@ -1,4 +1,4 @@
-"""The Markov moves of ``sampler.py`` compiled by Numba for the CPU: one session after the other.
+"""The Markov moves of ``sampler.py`` compiled by Numba for the CPU: each session by itself.
 
 A sample that has found its place costs nothing more, a session's numbers never leave the cache, and
 a call for one session costs a hundredth of one for a hundred. Innermost loops run over samples, so
@@ -7,8 +7,8 @@ that the processor takes several at once. The first call on a new machine takes 
 A move needs of ω only its return gaps: they turn with ω, and all samples of a group move towards
 one pole, so that a move costs as much for many features as for few.
 
-Shapes: S sessions, M samples, H answers, K options per query, D features, V moves, P groups of
-samples, U uniforms of a move, G = h (K-1) return gaps of the h answers that a session has.
+Shapes: S sessions, M samples, H answers, K options per query, D features, V moves, P sets of
+samples that share a pole, U uniforms of a move, G = h (K-1) return gaps of the h answers that a session has.
 """
 
 from __future__ import annotations

@@ -150,7 +150,7 @@ def _answer_one_of_two(returns: Array, probs: Array, sums: Array) -> float:
     """
     nats, bits = 0.0, 0.0
     sums[:] = 0.0
-    for start in range(0, returns.shape[1], 120):  # as many factors below 2 as float32 can multiply
+    for start in range(0, returns.shape[1], 120):  # as many factors up to 2 as float32 can multiply
         stop = start + 120
         logit, first, second = returns[0, start:stop], probs[0, start:stop], probs[1, start:stop]
         product, weighed, one, other = ONE, ZERO, ZERO, ZERO

@@ -4,8 +4,7 @@
 answers; the ceiling is one ``exp`` and one ``log`` over N·M numbers that lie in the cache, timed in
 the same run. A move of the belief evaluates H answers for each of S·M samples a few times over;
 its ceiling is one ``exp`` and one ``log`` for each evaluation: as many in all moves as in the
-first. ``--compile`` adds
-``torch.compile``.
+first. ``--compile`` adds ``torch.compile``.
 """
 
 from __future__ import annotations

@@ -8,7 +8,8 @@ A move needs of ω only its return gaps: they turn with ω, and all samples of a
 one pole, so that a move costs as much for many features as for few.
 
 Shapes: S sessions, M samples, H answers, K options per query, D features, V moves, P sets of
-samples that share a pole, U uniforms of a move, G = h (K-1) return gaps of the h answers that a session has.
+samples that share a pole, U uniforms of a move, G = h (K-1) return gaps of the h answers that a
+session has.
 """
 
 from __future__ import annotations

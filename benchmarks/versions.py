@@ -1,0 +1,135 @@
+"""What the parts of a session cost, beside an earlier version of this package.
+
+``git worktree add ../earlier 672a7d5`` (version 0.1.0), then ``python benchmarks/versions.py
+../earlier``. Each version is measured in processes of its own, in turn; the least CPU time of all
+repetitions counts, as whatever else the machine does only adds to it.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+MEASURE = "--measure"
+"""First argument of a process that measures the version in its working directory."""
+
+# Not this folder, whose select.py hides Python's.
+sys.path[0] = os.getcwd() if MEASURE in sys.argv else str(Path(__file__).resolve().parents[1])
+
+import json
+import subprocess
+import time
+from collections.abc import Callable
+
+from benchmarks import common
+
+
+def main() -> None:
+    """Print the table."""
+    parser = common.arguments(__doc__)
+    parser.add_argument("earlier", type=Path, help="a checkout of the earlier version")
+    options = common.start(parser)
+    folders = {"earlier": options.earlier.resolve(), "now": Path(sys.path[0])}
+    least: dict[str, dict[str, float]] = {version: {} for version in folders}
+    for _ in range(options.repeats // 3):
+        for version, folder in folders.items():
+            for name, seconds in measured_in(folder).items():
+                before = least[version].get(name, seconds)
+                least[version][name] = min(before, seconds)
+    rows: list[common.Row] = [
+        {
+            "CPU ms": name,
+            "earlier": 1000 * least["earlier"][name],
+            "now": 1000 * seconds,
+            "now / earlier": seconds / least["earlier"][name],
+        }
+        for name, seconds in least["now"].items()
+    ]
+    common.report("Two versions in turn, D = 4, K = 2, M = 100", rows, options.json)
+
+
+def measured_in(folder: Path) -> dict[str, float]:
+    """What :func:`measure` finds in a process that imports the package from a folder."""
+    environment = {**os.environ, "NUMBA_NUM_THREADS": "1"}
+    command = [sys.executable, str(Path(__file__).resolve()), MEASURE]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=folder)
+    if done.returncode != 0:
+        sys.exit(f"{folder}: cannot be measured\n{done.stderr}")
+    found: dict[str, float] = json.loads(done.stdout)
+    return found
+
+
+def measure() -> dict[str, float]:
+    """CPU seconds of each part, with names that both versions know."""
+    import torch
+
+    from torchrl_pref.acquisition import information_gain
+    from torchrl_pref.belief import Belief, feature_gaps, uniform_sphere
+    from torchrl_pref.envs import FeedEnv, QueryEnv
+    from torchrl_pref.features import Normalizer
+    from torchrl_pref.humans import SimulatedHuman
+    from torchrl_pref.queries import gridworld_pool
+    from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel
+    from torchrl_pref.strategies import Greedy, RandomAsk
+
+    torch.set_num_threads(1)
+    pool = gridworld_pool()
+    pool = pool.map_features(Normalizer.fit(pool.features))
+
+    def updates(model: ResponseModel, sessions: int, seed: int) -> float:
+        """CPU seconds of an update of one session, over 20 answers to random questions."""
+        generator, belief = torch.Generator().manual_seed(seed), Belief(model)
+        omega = uniform_sphere((sessions, 4, 1), generator)
+        samples, ess = belief.prior(sessions, 4, generator), torch.full((sessions,), 100.0)
+        gaps, seconds = torch.zeros(sessions, 0, 1, 4), 0.0
+        for _ in range(20):
+            asked = pool.features[torch.randint(1000, (sessions,), generator=generator)]
+            likely = model((asked @ omega).squeeze(-1)).exp()
+            newest = feature_gaps(asked, likely.multinomial(1, generator=generator).squeeze(-1))
+            start = time.process_time()
+            samples, ess, _ = belief.update(samples, ess, gaps, newest, generator)
+            seconds += time.process_time() - start
+            gaps = torch.cat([gaps, newest[:, None]], 1)
+        return seconds / 20 / sessions
+
+    def rollout(
+        kind: type[QueryEnv] | type[FeedEnv],
+        model: ResponseModel,
+        sessions: int,
+        strategy: Callable[..., object] | None,
+        seed: int,
+    ) -> float:
+        """CPU seconds of a step of one session."""
+        human, belief = SimulatedHuman(model), Belief(model)
+        env = kind(pool, human, belief, batch_size=(sessions,), seed=seed)
+        start = time.process_time()
+        with torch.no_grad():
+            steps = env.rollout(20, strategy)
+        return (time.process_time() - start) / steps.numel()
+
+    cases: dict[str, Callable[[int], float]] = {}
+    for human, model in (("tau 4.5", Boltzmann(4.5)), ("optimal", Optimal())):
+        for count in (1, 200):
+
+            def update(seed: int, model: ResponseModel = model, count: int = count) -> float:
+                return updates(model, count, seed)
+
+            def greedy(seed: int, model: ResponseModel = model, count: int = count) -> float:
+                return rollout(QueryEnv, model, count, Greedy(model, information_gain), seed)
+
+            cases[f"update, {human}, {count} sessions"] = update
+            cases[f"greedy step, {human}, {count} sessions"] = greedy
+    noisy = Boltzmann(4.5)
+    cases["random step, QueryEnv, 1 session"] = lambda seed: rollout(QueryEnv, noisy, 1, None, seed)
+    cases["asking step, FeedEnv, 1 session"] = lambda seed: rollout(
+        FeedEnv, noisy, 1, RandomAsk(1.0), seed
+    )
+    return {name: min(case(seed) for seed in range(4)) for name, case in cases.items()}
+
+
+if __name__ == "__main__":
+    if sys.argv[1:] == [MEASURE]:
+        print(json.dumps(measure()))
+    else:
+        main()

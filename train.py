@@ -231,6 +231,12 @@ def train(folder: Path, settings: dict[str, Any], task: Task, trainer: Trainer) 
 
     setup = settings["setup"]["name"]
     print(f"{setup} setup, {task.title}, run folder {folder}")
+    updates, warm_up = settings["training"]["updates"], settings["training"]["warm_up"]
+    if updates <= warm_up:
+        print(
+            f"note: only the critic learns in the first training.warm_up={warm_up} updates, and "
+            f"there are {updates}: the policy stays as it starts"
+        )
 
     def save() -> None:
         experiment.make_checkpoint(settings, task, trainer).save(folder / CHECKPOINT)

@@ -58,6 +58,7 @@ def test_train_evaluate_and_resume(tmp_path: Path) -> None:
     for row in ("random", "greedy information gain", "ask all (feed)", "RL-feed"):
         assert re.search(rf"^{re.escape(row)} +-?\d\.\d+ +-?\d\.\d+ +-?\d\.\d+", output, re.M)
     assert "noisy user (tau=" in output
+    assert "only the critic learns in the first training.warm_up=10 updates" in output
 
     output = run("evaluate.py", f"checkpoint={folder}", "evaluation.humans=7", cwd=tmp_path)
     assert "RL-feed" in output
@@ -227,6 +228,7 @@ BAD_INPUT = [
     ("train", "belief.samples=1", "belief.samples=1: expected a whole number of at least 2"),
     ("train", "belief.samples=many", "belief.samples='many': expected a whole number"),
     ("train", "pool.options=1", "pool.options=1: expected a whole number of at least 2"),
+    ("train", "pool.size=4e1", "pool.size=40.0: expected a whole number, without a point"),
     ("train", "pool.size=0", "pool.size=0: expected a whole number of at least 1"),
     ("train", "setup.budget=0", "setup.budget=0: expected a whole number of at least 1"),
     ("train", "setup.offers=3", "setup.offers=3: expected a whole number of at least"),

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,6 +19,7 @@ from torchrl_pref.comparison import (
     group_checkpoints,
 )
 from torchrl_pref.envs import FeedEnv, QueryEnv
+from torchrl_pref.errors import InputError
 from torchrl_pref.evaluation import CURVES, bootstrap_interval, draw_humans, evaluate
 from torchrl_pref.experiment import make_checkpoint, make_query_env
 from torchrl_pref.policies import paper_policy
@@ -162,6 +164,26 @@ def test_runs_of_one_kind_are_told_apart_by_their_names() -> None:
     ((settings, _, learned),) = group_checkpoints(runs)
     assert list(learned) == ["RL (a)", "RL (b)", "RL-feed"]
     assert settings["setup"]["name"] == "feed"  # the baselines of a feed are shown too
+
+
+def test_what_a_skip_costs_is_a_matter_of_feeds_alone() -> None:
+    runs = []
+    for name, setup, skip in (
+        ("a", "query", "regret"),
+        ("b", "query", "free"),
+        ("c", "feed", "free"),
+    ):
+        settings = settings_of(setup)
+        settings["skip"] = skip
+        trainer, task = trainer_of(settings)
+        runs.append((name, make_checkpoint(settings, task, trainer), task))
+    ((settings, _, learned),) = group_checkpoints(runs)
+    assert len(learned) == 3
+    assert settings["skip"] == "free"
+    _, other, task = runs[-1]
+    regretful = replace(other, settings={**other.settings, "skip": "regret"})
+    with pytest.raises(InputError, match="differ in skip: regret and free"):
+        group_checkpoints([*runs, ("d", regretful, task)])
 
 
 def test_bootstrap_agrees_with_scipy(generator: Generator) -> None:

@@ -138,6 +138,12 @@ def _feed_of(checkpoint: Checkpoint) -> tuple[Any, Any] | None:
     return (setup["offers"], setup["on_skip"]) if setup["name"] == "feed" else None
 
 
+def _skip_of(checkpoint: Checkpoint) -> str | None:
+    """What a skip costs in a run's feed; None for a run that asks queries."""
+    settings = checkpoint.settings
+    return str(settings["skip"]) if settings["setup"]["name"] == "feed" else None
+
+
 def group_checkpoints(
     runs: Sequence[tuple[str, Checkpoint, Task]],
 ) -> list[tuple[Settings, Task, dict[str, Checkpoint]]]:
@@ -168,7 +174,7 @@ def group_checkpoints(
                 ("budget", *(c.settings["setup"]["budget"] for c in (checkpoint, first))),
                 ("belief", *(c.settings["belief"] for c in (checkpoint, first))),
                 ("tau_spread", *(c.settings["tau_spread"] for c in (checkpoint, first))),
-                ("skip", *(c.settings["skip"] for c in (checkpoint, first))),
+                ("skip", _skip_of(checkpoint), next(filter(None, map(_skip_of, all_of)), None)),
                 ("feed", _feed_of(checkpoint), next(filter(None, map(_feed_of, all_of)), None)),
             ):
                 if mine is not None and mine != theirs:
@@ -185,5 +191,6 @@ def group_checkpoints(
             (c.settings["setup"] for _, c, _ in members), key=lambda setup: setup["name"] == "feed"
         )
         settings["setup"] = {key: value for setup in by_feed_last for key, value in setup.items()}
+        settings["skip"] = next(filter(None, map(_skip_of, all_of)), settings["skip"])
         panels.append((settings, task, learned))
     return panels

@@ -23,6 +23,11 @@ def check_count(name: str, value: Any, minimum: int) -> int:
     Raises:
         InputError: it is not.
     """
+    if isinstance(value, float) and value.is_integer() and value >= minimum:
+        raise InputError(
+            f"{name}={value!r}: expected a whole number, without a point or an exponent; "
+            f"set {name}={value:.0f}"
+        )
     if isinstance(value, bool) or not isinstance(value, int) or value < minimum:
         raise InputError(
             f"{name}={value!r}: expected a whole number of at least {minimum}; "

@@ -99,8 +99,9 @@ def training_figure(name: str, progress: Progress, path: Path) -> None:
         count = len(next(iter(progress.held_out.values())))
         figure.supxlabel(
             f"above: alignment after the last query, mean of {count} humans that no training met, "
-            "the same ones with the same luck\neach time; band and bars are 95% intervals; "
-            "below: means over the episodes of the training",
+            "on the held-out pool with as many candidates\nor offers as in training, the same "
+            "humans with the same luck each time; band and bars are 95% intervals; "
+            "below: means over\nthe episodes of the training",
             fontsize="small",
             color="#555555",
         )

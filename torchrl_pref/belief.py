@@ -33,8 +33,8 @@ MAX_STAGES = 12
 """Of one answer: twelve stages that keep a quarter each leave less than one in ten million."""
 
 SURPRISE = 0.1
-"""A soft answer makes the belief begin anew where all answers that it held for no likelier had less
-than this probability together. If the belief is right, that is rarer still."""
+"""A soft answer makes the belief begin anew where the samples together gave it less than this share
+of the probability that it could have: what none of them is near may then weigh as much."""
 
 RESTART_SHARE, RESTART_STAGES = 0.5, 500
 """What each stage of a new beginning keeps, and how many stages there may be: it must find every
@@ -192,16 +192,16 @@ class Belief:
         return Update(moved, torch.where(used, self.n_samples / inflation, ess), used)
 
     def _surprised(self, samples: Tensor, answers: Tensor) -> Tensor:
-        """(S), whether samples (S M D) held the last of the answers for too unlikely."""
-        gaps = _gaps(samples, answers)
-        # Of all options, less that of the one that was chosen.
-        returns = F.pad(-gaps[:, :, -1], (1, 0))
-        foreseen = self.response_model(returns).exp().mean(1)
-        no_likelier = foreseen <= foreseen[:, :1] * (1 + 1e-5)
-        surprised = (foreseen * no_likelier).sum(1) < SURPRISE
+        """(S), whether samples (S M D) held the last of answers (S H K-1 D) for too unlikely."""
+        model, gaps, newest = self.response_model, _gaps(samples, answers), answers[:, -1]
+        foreseen = model.log_likelihood(gaps[:, :, -1]).exp()
+        # The most that any ω would give it, or nearly: that of the sample or the mean gap.
+        ahead = F.normalize(newest.sum(1), dim=-1).unsqueeze(1)
+        most = model.log_likelihood(_gaps(ahead, newest)).exp()
+        most = torch.cat([foreseen, most], 1).amax(1)
         # Where an answer can be impossible no power of its likelihood makes it less so.
-        opposite = self.response_model.joint_log_likelihood(-gaps)
-        return surprised & opposite.isfinite().all(1)
+        possible = model.joint_log_likelihood(-gaps).isfinite().all(1)
+        return possible & (foreseen.mean(1) < SURPRISE * most)
 
     def _let_in(
         self, samples: Tensor, inflation: Tensor, answers: Tensor, generator: Generator

@@ -20,6 +20,7 @@ import math
 import time
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from itertools import product
 from multiprocessing import get_context
 from typing import NamedTuple
@@ -83,6 +84,7 @@ def main() -> None:
     """Print the table of the worst cases, and every case beyond a bound."""
     parser = common.arguments(__doc__)
     parser.add_argument("--sessions", type=int, default=200, help="beliefs a case (default 200)")
+    parser.add_argument("--samples", type=int, default=100, help="M of each (default 100)")
     parser.add_argument("--features", default="2,4,6,8,16", help="numbers of features D")
     parser.add_argument("--options", default="2,3,5", help="numbers of options K")
     parser.add_argument("--csv", type=Path, help="also write every case to this file")
@@ -92,7 +94,9 @@ def main() -> None:
     options_of = [int(number) for number in options.options.split(",")]
     cases = [Case(*case) for case in product(sizes, options_of, (0.5, 4.5, 30.0, None), KINDS)]
     with ProcessPoolExecutor(options.workers, get_context("spawn"), _one_thread) as executor:
-        jobs = executor.map(measure, cases, [options.sessions] * len(cases))
+        jobs = executor.map(
+            partial(measure, sessions=options.sessions, n_samples=options.samples), cases
+        )
         done = zip(cases, tqdm(jobs, total=len(cases), unit="case"), strict=True)
         results = dict(done if options.csv is None else _written(done, options.csv))
     common.report(f"Worst of the cases, K = {options.options}", list(_worst(results)), options.json)
@@ -143,19 +147,21 @@ def _is_beyond(measured: Measured) -> bool:
     return measured.bias > BOUND or abs(measured.variance - 1) > BOUND
 
 
-def measure(case: Case, sessions: int) -> Measured:
+def measure(case: Case, sessions: int, n_samples: int = 100) -> Measured:
     """One case; four times the sessions where the first ones are beyond a bound."""
     gaps = history(case)
     exact = posterior(gaps.double().numpy(), case.tau)
-    measured = compare(case, gaps, exact, sessions)
+    measured = compare(case, gaps, exact, sessions, n_samples)
     if _is_beyond(measured):
-        measured = compare(case, gaps, exact, 4 * sessions)
+        measured = compare(case, gaps, exact, 4 * sessions, n_samples)
     return measured
 
 
-def compare(case: Case, gaps: Tensor, exact: Posterior, sessions: int) -> Measured:
+def compare(
+    case: Case, gaps: Tensor, exact: Posterior, sessions: int, n_samples: int = 100
+) -> Measured:
     """Beliefs that all get the answers with these gaps (H K-1 D), beside the posterior."""
-    generator, belief = Generator().manual_seed(1), Belief(case.model)
+    generator, belief = Generator().manual_seed(1), Belief(case.model, n_samples)
     samples = belief.prior(sessions, case.features, generator)
     ess = torch.full((sessions,), float(belief.n_samples))
     start = time.process_time()

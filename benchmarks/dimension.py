@@ -24,36 +24,35 @@ from torchrl_pref.acquisition import information_gain, score_queries
 from torchrl_pref.belief import Belief, feature_gaps, uniform_sphere
 from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel
 
-BELIEFS = 100
-
 
 def main() -> None:
     """Print the table."""
     parser = common.arguments(__doc__)
     parser.add_argument("--features", default="2,4,8,16,32", help="numbers of features D")
     parser.add_argument("--questions", type=int, default=100)
+    parser.add_argument("--beliefs", type=int, default=100, help="that the size is measured over")
     options = common.start(parser)
     rows = []
     for size in map(int, options.features.split(",")):
         for model in (Boltzmann(common.TAU), Optimal()):
-            rows.append(follow(size, model, options.questions))
+            rows.append(follow(size, model, options.questions, options.beliefs))
     common.report("Effective size of 100 samples, greedy questions", rows, options.json)
 
 
-def follow(n_features: int, model: ResponseModel, questions: int) -> common.Row:
+def follow(n_features: int, model: ResponseModel, questions: int, beliefs: int) -> common.Row:
     """One human's answers, many beliefs."""
     generator, belief = Generator().manual_seed(0), Belief(model)
     omega = uniform_sphere((n_features,), generator)
-    samples = belief.prior(BELIEFS, n_features, generator)
-    ess = torch.full((BELIEFS,), 100.0)
-    gaps = torch.zeros(BELIEFS, 0, 1, n_features)
+    samples = belief.prior(beliefs, n_features, generator)
+    ess = torch.full((beliefs,), 100.0)
+    gaps = torch.zeros(beliefs, 0, 1, n_features)
     measured, reported, seconds = [], [], 0.0
     for _ in tqdm(range(questions), desc=f"D={n_features}, {model}", unit="question"):
         pool = torch.randn(1000, 2, n_features, generator=generator)
         values = score_queries(samples[:1], pool[None], model, information_gain)
         query = pool[int(values.argmax())]
         answer = model(query @ omega).exp().multinomial(1, generator=generator)
-        newest = feature_gaps(query[None], answer).expand(BELIEFS, -1, -1)
+        newest = feature_gaps(query[None], answer).expand(beliefs, -1, -1)
         start = time.process_time()
         samples, ess, _ = belief.update(samples, ess, gaps, newest, generator)
         seconds += time.process_time() - start
@@ -74,7 +73,7 @@ def follow(n_features: int, model: ResponseModel, questions: int) -> common.Row:
         )
         if min(measured) < 95
         else 1.0,
-        "ms an update": 1000 * seconds / questions / BELIEFS,
+        "ms an update": 1000 * seconds / questions / beliefs,
         "alignment": float((samples @ omega).mean()),
     }
 

@@ -41,7 +41,8 @@ def spoiled_settings(content: dict[str, Any]) -> Iterator[Case]:
             del at(content["settings"], place[:-1])[place[-1]]
 
         name = ".".join(place)
-        yield edited(content, "spoiled settings", f"without {name}", remove)
+        if name != "evaluation.during":  # version 0.1.0 wrote none
+            yield edited(content, "spoiled settings", f"without {name}", remove)
         for wrong in (5, "text", None, []) if isinstance(value, dict) else WRONG[type(value)]:
 
             def replace(
@@ -62,7 +63,10 @@ def spoiled_content(content: dict[str, Any]) -> Iterator[Case]:
                 content, "spoiled content", name, lambda c, k=key, w=wrong: c.update({k: w})
             )
     for key in content["training"]:
-        yield edited(content, "spoiled content", f"no {key}", lambda c, k=key: c["training"].pop(k))
+        if key not in ("held_out", "baseline"):  # version 0.1.0 wrote neither
+            yield edited(
+                content, "spoiled content", f"no {key}", lambda c, k=key: c["training"].pop(k)
+            )
         for wrong in ("text", -1, [1], {"a": "b"}, torch.ones(3), b"bytes"):
             name = f"training.{key}={str(wrong)[:20]}"
             yield edited(

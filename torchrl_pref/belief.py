@@ -97,8 +97,8 @@ class Belief:
         samples: M, at least 2. With fewer than 20 each sample has too much of a say in where the
             others move, and the spread comes out up to 3% too small.
         moves: Markov moves after each resampling, at least 1; None: as many as there are features
-            (D²/8 beyond 8), and at least 4. They are repeated where the samples have not forgotten
-            where they were.
+            (D²/8 beyond 8, D³/128 beyond 16), and at least 4. They are repeated where the samples
+            have not forgotten where they were.
 
     Raises:
         InputError: there is no response model, or ``samples`` or ``moves`` is too small.
@@ -158,10 +158,12 @@ class Belief:
         return Update(*(torch.cat(field) for field in zip(*updates, strict=True)))
 
     def _moves_for(self, n_features: int) -> int:
-        """V: with many features 100 samples tell less and less well where they spread."""
+        """V: with many features 100 samples tell less and less well where they spread, and a walk
+        in a cone is longer: of the order of D³ (Lovász and Vempala, *Hit-and-run from a corner*,
+        2006)."""
         if self.n_moves is not None:
             return self.n_moves
-        return max(4, n_features, n_features**2 // 8)
+        return max(4, n_features, n_features**2 // 8, n_features**3 // 128)
 
     def _update(
         self, samples: Tensor, ess: Tensor, earlier: Tensor, newest: Tensor, generator: Generator

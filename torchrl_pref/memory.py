@@ -109,7 +109,7 @@ def _belief_parts(settings: dict[str, Any], n_options: int, n_features: int) -> 
     sessions = settings.get("training", {}).get("sessions", 0)
     sessions = max(sessions, settings["evaluation"]["humans"])
     samples = belief["samples"]
-    moves = belief["moves"] or max(4, n_features, n_features**2 // 8)
+    moves = belief["moves"] or max(4, n_features, n_features**2 // 8, n_features**3 // 128)
     at_once = max(samples, min(sessions * samples, MOVED // moves))
     directions = 4.0 * (UNIFORMS * moves + 4 * n_features) * at_once
     yield Part("moving the belief", directions, ("belief.samples", "belief.moves"))

@@ -13,6 +13,7 @@ from typing import Any, TextIO
 
 from torch import Tensor
 
+from torchrl_pref.errors import InputError
 from torchrl_pref.evaluation import bootstrap_interval
 from torchrl_pref.writing import replacing
 
@@ -85,13 +86,22 @@ def start_table(path: Path, progress: Progress, frames: int) -> None:
         path: of the table.
         progress: of the run.
         frames: steps of all sessions in one update.
+
+    Raises:
+        InputError: the table cannot be written.
     """
     first = 0 if 0 in progress.held_out else 1
-    with replacing(path) as partial, partial.open("w", newline="") as file:
-        writer = _writer(file, progress)
-        writer.writeheader()
-        for update in range(first, progress.update + 1):
-            writer.writerow(progress.row(update, frames))
+    try:
+        with replacing(path) as partial, partial.open("w", newline="") as file:
+            writer = _writer(file, progress)
+            writer.writeheader()
+            for update in range(first, progress.update + 1):
+                writer.writerow(progress.row(update, frames))
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be written ({error.strerror}); expected a file, or nothing, in a "
+            "folder that can be written"
+        ) from None
 
 
 def add_row(path: Path, progress: Progress, frames: int) -> None:

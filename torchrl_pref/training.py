@@ -163,12 +163,14 @@ class Trainer:
         """
         settings, progress = self.settings, self.progress
         table = folder / "training.csv"
-        logger = get_logger("tensorboard", logger_name=str(folder), experiment_name="tensorboard")
-        assert logger is not None
         bar = tqdm(total=settings.updates, initial=progress.update, desc="training", unit="update")
         with bar, _stop_request() as stopped:
             measure()
             start_table(table, progress, self.frames)
+            logger = get_logger(
+                "tensorboard", logger_name=str(folder), experiment_name="tensorboard"
+            )
+            assert logger is not None
             while progress.update < settings.updates and not stopped():
                 start = time.perf_counter()
                 batch = self.sessions.collect()

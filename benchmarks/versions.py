@@ -71,7 +71,7 @@ def measure() -> dict[str, float]:
     from torchrl_pref.humans import SimulatedHuman
     from torchrl_pref.queries import gridworld_pool
     from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel
-    from torchrl_pref.strategies import Greedy, RandomAsk
+    from torchrl_pref.strategies import Greedy
 
     torch.set_num_threads(1)
     pool = gridworld_pool()
@@ -93,20 +93,26 @@ def measure() -> dict[str, float]:
             gaps = torch.cat([gaps, newest[:, None]], 1)
         return seconds / 20 / sessions
 
-    def rollout(
-        kind: type[QueryEnv] | type[FeedEnv],
-        model: ResponseModel,
-        sessions: int,
-        strategy: Callable[..., object] | None,
-        seed: int,
-    ) -> float:
-        """CPU seconds of a step of one session."""
+    def greedily(model: ResponseModel, sessions: int, seed: int) -> float:
+        """CPU seconds of a step of one session, by the greedy strategy."""
         human, belief = SimulatedHuman(model), Belief(model)
-        env = kind(pool, human, belief, batch_size=(sessions,), seed=seed)
+        env = QueryEnv(pool, human, belief, batch_size=(sessions,), seed=seed)
         start = time.process_time()
         with torch.no_grad():
-            steps = env.rollout(20, strategy)
-        return (time.process_time() - start) / steps.numel()
+            taken = env.rollout(20, Greedy(model, information_gain))
+        return (time.process_time() - start) / taken.numel()
+
+    def steps(kind: type[QueryEnv] | type[FeedEnv], action: int, seed: int) -> float:
+        """CPU seconds of a step of one session that takes the same action again and again."""
+        model, seconds = Boltzmann(4.5), 0.0
+        env = kind(pool, SimulatedHuman(model), Belief(model), batch_size=(1,), seed=seed)
+        session = env.reset()
+        for _ in range(20):
+            session["action"] = torch.tensor([action])
+            start = time.process_time()
+            session = env.step(session)["next"]
+            seconds += time.process_time() - start
+        return seconds / 20
 
     cases: dict[str, Callable[[int], float]] = {}
     for human, model in (("tau 4.5", Boltzmann(4.5)), ("optimal", Optimal())):
@@ -116,15 +122,13 @@ def measure() -> dict[str, float]:
                 return updates(model, count, seed)
 
             def greedy(seed: int, model: ResponseModel = model, count: int = count) -> float:
-                return rollout(QueryEnv, model, count, Greedy(model, information_gain), seed)
+                return greedily(model, count, seed)
 
             cases[f"update, {human}, {count} sessions"] = update
             cases[f"greedy step, {human}, {count} sessions"] = greedy
-    noisy = Boltzmann(4.5)
-    cases["random step, QueryEnv, 1 session"] = lambda seed: rollout(QueryEnv, noisy, 1, None, seed)
-    cases["asking step, FeedEnv, 1 session"] = lambda seed: rollout(
-        FeedEnv, noisy, 1, RandomAsk(1.0), seed
-    )
+    cases["asking step, QueryEnv, 1 session"] = lambda seed: steps(QueryEnv, 100, seed)
+    cases["asking step, FeedEnv, 1 session"] = lambda seed: steps(FeedEnv, 1, seed)
+    cases["skipping step, FeedEnv, 1 session"] = lambda seed: steps(FeedEnv, 0, seed)
     return {name: min(case(seed) for seed in range(4)) for name, case in cases.items()}
 
 

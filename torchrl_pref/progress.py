@@ -83,7 +83,7 @@ def start_table(path: Path, progress: Progress, frames: int) -> None:
     after its last checkpoint, or half of one, are gone, and the others come out the same.
 
     Args:
-        path: of the table.
+        path: of the table; its folder is made where there is none.
         progress: of the run.
         frames: steps of all sessions in one update.
 
@@ -92,6 +92,7 @@ def start_table(path: Path, progress: Progress, frames: int) -> None:
     """
     first = 0 if 0 in progress.held_out else 1
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as partial, partial.open("w", newline="") as file:
             writer = _writer(file, progress)
             writer.writeheader()

@@ -1,9 +1,12 @@
-"""Loops over sessions in threads."""
+"""The machine code of compiled functions is kept where it can be; loops in threads."""
 
 import os
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +17,16 @@ from torchrl_pref.acquisition import information_gain, score_queries
 from torchrl_pref.belief import Belief
 from torchrl_pref.compiled import FEWEST, over_sessions, share_out
 from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel
+
+FAR_FROM_HERE = """
+from torchrl_pref.compiled import compiled
+
+@compiled
+def double(x: float) -> float:
+    return 2.0 * x
+
+print(double(21.0))
+"""
 
 
 @pytest.fixture
@@ -94,3 +107,23 @@ def test_no_number_depends_on_the_threads(model: ResponseModel, threads_back: No
 
     for one, three in zip(followed(1), followed(3), strict=True):
         assert torch.equal(one, three)
+
+
+@pytest.mark.parametrize("writable", [True, False], ids=["kept", "nowhere"])
+def test_a_tree_and_a_home_that_cannot_be_written(writable: bool, tmp_path: Path) -> None:
+    """A file where each cache folder would be stands for what may not be written: root may
+    write everywhere else."""
+    source = tmp_path / "double.py"
+    source.write_text(FAR_FROM_HERE)
+    if not writable:
+        (tmp_path / "__pycache__").write_text("")
+    file = tmp_path / "file"
+    file.write_text("")
+    places = {"NUMBA_CACHE_DIR": f"{file}/x", "XDG_CACHE_HOME": f"{file}/x", "HOME": f"{file}/x"}
+    environment = {**os.environ, **places, "PYTHONPATH": str(Path(__file__).parent.parent)}
+    done = subprocess.run(
+        [sys.executable, source], env=environment, capture_output=True, text=True, timeout=120
+    )
+    assert (done.stdout, done.returncode) == ("42.0\n", 0), done.stderr
+    kept = [path.name for path in tmp_path.rglob("double.double-*")]
+    assert bool(kept) == writable

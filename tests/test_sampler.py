@@ -64,7 +64,7 @@ def test_compiled_moves_go_where_those_in_tensors_do(
             difference = (poles - tensor_poles(samples, normal)) / lengths
             assert difference.norm(dim=-1).median() < 1e-3
             shares = explained_share(samples, compiled), tensor_share(samples, compiled)
-            assert torch.allclose(*shares, atol=1e-2)
+            assert torch.allclose(*shares, atol=1e-3)
 
 
 @pytest.mark.parametrize("model", RESPONSE_MODELS, ids=str)
@@ -135,7 +135,8 @@ def test_resampling_is_the_same_compiled_and_in_tensors(generator: Generator) ->
 def test_equal_weights_leave_every_sample(generator: Generator) -> None:
     samples = torch.randn(7, 40, 3, generator=generator)
     copies, factor = resample(samples, torch.zeros(7, 40), generator)
-    assert torch.equal(copies.sort(1).values, samples.sort(1).values)
+    rows = (torch.take_along_dim(t, t[..., :1].argsort(1), 1) for t in (copies, samples))
+    assert torch.equal(*rows)
     assert torch.allclose(factor, torch.ones(7))
 
 

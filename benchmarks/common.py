@@ -39,10 +39,15 @@ def arguments(description: str | None) -> argparse.ArgumentParser:
 
 
 def start(parser: argparse.ArgumentParser) -> argparse.Namespace:
-    """Read the command line and set torch to one thread."""
+    """Read the command line, and take one thread."""
+    one_thread()
+    return parser.parse_args()
+
+
+def one_thread() -> None:
+    """Torch and the compiled loops take one thread in this process."""
     torch.set_num_threads(1)
     share_out(1)
-    return parser.parse_args()
 
 
 def devices() -> list[str]:

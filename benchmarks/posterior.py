@@ -33,7 +33,6 @@ from benchmarks import common
 from tests.posterior import Posterior, posterior
 from torchrl_pref.acquisition import information_gain, score_queries
 from torchrl_pref.belief import Belief, feature_gaps, uniform_sphere
-from torchrl_pref.compiled import share_out
 from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel
 
 BOUND = 0.02
@@ -93,7 +92,7 @@ def main() -> None:
     sizes = [int(size) for size in options.features.split(",")]
     options_of = [int(number) for number in options.options.split(",")]
     cases = [Case(*case) for case in product(sizes, options_of, (0.5, 4.5, 30.0, None), KINDS)]
-    with ProcessPoolExecutor(options.workers, get_context("spawn"), _one_thread) as executor:
+    with ProcessPoolExecutor(options.workers, get_context("spawn"), common.one_thread) as executor:
         jobs = executor.map(
             partial(measure, sessions=options.sessions, n_samples=options.samples), cases
         )
@@ -136,11 +135,6 @@ def _worst(results: dict[Case, Measured]) -> Iterator[common.Row]:
             "ESS, least": min(m.effective for m in some),
             "ms an update": sum(m.milliseconds for m in some) / len(some),
         }
-
-
-def _one_thread() -> None:
-    torch.set_num_threads(1)
-    share_out(1)
 
 
 def _is_beyond(measured: Measured) -> bool:

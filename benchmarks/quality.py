@@ -28,7 +28,6 @@ from tqdm import tqdm
 from benchmarks import common
 from torchrl_pref.checkpoint import Checkpoint
 from torchrl_pref.comparison import FIRST_EVALUATION_SEED
-from torchrl_pref.compiled import share_out
 from torchrl_pref.envs import FeedEnv, QueryEnv
 from torchrl_pref.evaluation import draw_humans
 from torchrl_pref.experiment import (
@@ -91,8 +90,7 @@ def main() -> None:
 
 def run_pool(job: Job) -> list[list[list[float]]]:
     """Of each run and each of the package's policies: alignment at the end, and mean of 1 to H."""
-    torch.set_num_threads(1)
-    share_out(1)
+    common.one_thread()
     shipped = [pretrained_checkpoint(job.cell.setup, str(job.cell.tau), s) for s in range(SEEDS)]
     settings = shipped[0].settings
     grid, pool = settings["grid"], settings["pool"]

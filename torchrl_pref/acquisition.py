@@ -143,10 +143,11 @@ def score_queries(
     if constants is None or not known or not (_is_plain(samples) and _is_plain(queries)):
         return score_in_tensors(samples, queries, response_model, acquisition)
     scores = compiled_scores(samples, queries, *constants)
-    columns = [COMPILED.index(each) for each in functions]
     if not isinstance(acquisition, Together):
-        return scores[..., columns[0]]
-    return scores if columns == [0, 1, 2] else scores[..., columns]
+        return scores[..., COMPILED.index(acquisition)]
+    if functions == COMPILED:
+        return scores
+    return scores[..., [COMPILED.index(each) for each in functions]]
 
 
 def _is_plain(numbers: Tensor) -> bool:

@@ -21,6 +21,7 @@ from torch import Generator, Tensor
 from torch.nn import functional as F
 
 from torchrl_pref.errors import check_count, check_type
+from torchrl_pref.memory import default_moves
 from torchrl_pref.resampling import kish_share, resample
 from torchrl_pref.responses import ResponseModel
 from torchrl_pref.sampler import Target, round_of_moves
@@ -158,12 +159,8 @@ class Belief:
         return Update(*(torch.cat(field) for field in zip(*updates, strict=True)))
 
     def _moves_for(self, n_features: int) -> int:
-        """V: with many features 100 samples tell less and less well where they spread, and a walk
-        in a cone is longer: of the order of D³ (Lovász and Vempala, *Hit-and-run from a corner*,
-        2006)."""
-        if self.n_moves is not None:
-            return self.n_moves
-        return max(4, n_features, n_features**2 // 8, n_features**3 // 128)
+        """V."""
+        return default_moves(n_features) if self.n_moves is None else self.n_moves
 
     def _update(
         self, samples: Tensor, ess: Tensor, earlier: Tensor, newest: Tensor, generator: Generator
@@ -173,7 +170,8 @@ class Belief:
         foreseen = self.response_model.log_likelihood(_gaps(samples, newest))
         surprised = foreseen.exp().mean(1) < SURPRISE
         if surprised.any():
-            surprised[surprised.clone()] = self._surprised(samples[surprised], answers[surprised])
+            indeed = self._surprised(samples[surprised], answers[surprised])
+            surprised = surprised.masked_scatter(surprised, indeed)
         few = ~surprised & (kish_share(foreseen) < MIN_SHARE)
         inflation = self.n_samples / ess
         plain = ~(surprised | few)

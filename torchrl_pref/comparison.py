@@ -187,10 +187,8 @@ def group_checkpoints(
             learned[label if same == 1 else f"{label} ({name})"] = checkpoint
         # Baselines choose as the query runs may; a feed among them adds its offers.
         settings = dict(first.settings)
-        by_feed_last = sorted(
-            (c.settings["setup"] for _, c, _ in members), key=lambda setup: setup["name"] == "feed"
-        )
-        settings["setup"] = {key: value for setup in by_feed_last for key, value in setup.items()}
-        settings["skip"] = next(filter(None, map(_skip_of, all_of)), settings["skip"])
+        feed_last = sorted(all_of, key=lambda c: bool(c.settings["setup"]["name"] == "feed"))
+        settings["setup"] = {k: v for c in feed_last for k, v in c.settings["setup"].items()}
+        settings["skip"] = feed_last[-1].settings["skip"]
         panels.append((settings, task, learned))
     return panels

@@ -103,13 +103,22 @@ def _shown(settings: dict[str, Any], n_queries: int, n_options: int, n_features:
     return min(n_queries, candidates or n_queries) * each
 
 
+def default_moves(n_features: int) -> int:
+    """V of a belief whose ``moves`` is None.
+
+    With many features 100 samples tell less and less well where they spread, and a walk in a cone
+    is longer: of the order of D³ (Lovász and Vempala, *Hit-and-run from a corner*, 2006).
+    """
+    return max(4, n_features, n_features**2 // 8, n_features**3 // 128)
+
+
 def _belief_parts(settings: dict[str, Any], n_options: int, n_features: int) -> Iterator[Part]:
     """What an update of the belief holds at once, for sessions in groups of so many samples."""
     belief, budget = settings["belief"], settings["setup"]["budget"]
     sessions = settings.get("training", {}).get("sessions", 0)
     sessions = max(sessions, settings["evaluation"]["humans"])
     samples = belief["samples"]
-    moves = belief["moves"] or max(4, n_features, n_features**2 // 8, n_features**3 // 128)
+    moves = belief["moves"] or default_moves(n_features)
     at_once = max(samples, min(sessions * samples, MOVED // moves))
     directions = 4.0 * (UNIFORMS * moves + 4 * n_features) * at_once
     yield Part("moving the belief", directions, ("belief.samples", "belief.moves"))

@@ -121,25 +121,17 @@ def _every_answer() -> list[common.Row]:
 
 def _follow(model: ResponseModel, greedy: bool) -> tuple[list[float], list[float]]:
     """Effective sample size after each answer of one human, over 1000 beliefs: true, reported."""
-    generator, belief, pool = Generator().manual_seed(0), Belief(model), common.normalised_pool()
-    omega = uniform_sphere((pool.n_features,), generator)
-    samples, ess = belief.prior(1000, pool.n_features, generator), torch.full((1000,), 100.0)
-    history = torch.zeros(1000, 0, 1, pool.n_features)
-    measured, reported = [], []
-    for _ in range(max(ANSWERS)):
+    pool = common.normalised_pool()
+
+    def question(samples: Tensor, generator: Generator) -> Tensor:
         index = torch.randint(len(pool), (1,), generator=generator)
         if greedy:
-            values = score_queries(samples[:1], pool.features[None], model, information_gain)
+            values = score_queries(samples, pool.features[None], model, information_gain)
             index = values.argmax(1)
-        query = pool.features[index]
-        answer = model(query @ omega).exp().multinomial(1, generator=generator).squeeze(-1)
-        newest = feature_gaps(query, answer).expand(1000, -1, -1)
-        samples, ess, _ = belief.update(samples, ess, history, newest, generator)
-        history = torch.cat([history, newest.unsqueeze(1)], 1)
-        variance = samples.flatten(0, 1).var(0).sum()
-        measured.append(float(variance / samples.mean(1).var(0).sum()))
-        reported.append(float(ess.mean()))
-    return measured, reported
+        return pool.features[int(index)]
+
+    followed = common.follow(model, pool.n_features, 1000, [question] * max(ANSWERS))
+    return followed.measured, followed.reported
 
 
 def _conversation(model: ResponseModel) -> tuple[Tensor, Tensor]:

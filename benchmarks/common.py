@@ -12,17 +12,19 @@ import json
 import platform
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from tabulate import tabulate
+from torch import Generator, Tensor
 
-from torchrl_pref.belief import uniform_sphere
+from torchrl_pref.belief import Belief, feature_gaps, uniform_sphere
 from torchrl_pref.compiled import share_out
 from torchrl_pref.features import Normalizer
 from torchrl_pref.queries import QueryPool, gridworld_pool
+from torchrl_pref.responses import ResponseModel
 
 TAU = 4.5
 """About what ``tau=noisy`` solves to on the default pool."""
@@ -48,6 +50,54 @@ def one_thread() -> None:
     """Torch and the compiled loops take one thread in this process."""
     torch.set_num_threads(1)
     share_out(1)
+
+
+class Followed(NamedTuple):
+    """Many beliefs after each answer of one human."""
+
+    measured: list[float]
+    """Effective sample size of their means, from how much these differ."""
+    reported: list[float]
+    """What the beliefs report of themselves."""
+    seconds: float
+    """CPU time of all updates of all beliefs."""
+    alignment: float
+    """Of the samples with the human, in the end."""
+
+
+def follow(
+    model: ResponseModel,
+    n_features: int,
+    n_beliefs: int,
+    questions: Iterable[Callable[[Tensor, Generator], Tensor]],
+) -> Followed:
+    """Ask one human question after question, and tell many beliefs.
+
+    Args:
+        model: of the human and of the beliefs.
+        n_features: D.
+        n_beliefs: how many.
+        questions: each makes, from the samples of the first belief (1 M D) and a generator, the
+            options (K D) that are asked about.
+    """
+    generator, belief = Generator().manual_seed(0), Belief(model)
+    omega = uniform_sphere((n_features,), generator)
+    samples = belief.prior(n_beliefs, n_features, generator)
+    ess = torch.full((n_beliefs,), float(belief.n_samples))
+    gaps = torch.zeros(n_beliefs, 0, 1, n_features)
+    measured, reported, seconds = [], [], 0.0
+    for question in questions:
+        query = question(samples[:1], generator)
+        answer = model(query @ omega).exp().multinomial(1, generator=generator)
+        newest = feature_gaps(query[None], answer).expand(n_beliefs, -1, -1)
+        start = time.process_time()
+        samples, ess, _ = belief.update(samples, ess, gaps, newest, generator)
+        seconds += time.process_time() - start
+        gaps = torch.cat([gaps, newest.unsqueeze(1)], 1)
+        variance = samples.double().flatten(0, 1).var(0).sum()
+        measured.append(float(variance / samples.double().mean(1).var(0).sum()))
+        reported.append(float(1 / (1 / ess).mean()))
+    return Followed(measured, reported, seconds, float((samples @ omega).mean()))
 
 
 def devices() -> list[str]:

@@ -13,15 +13,12 @@ from pathlib import Path
 
 sys.path[0] = str(Path(__file__).resolve().parents[1])  # this folder's select.py hides Python's
 
-import time
-
 import torch
-from torch import Generator
+from torch import Generator, Tensor
 from tqdm import tqdm
 
 from benchmarks import common
 from torchrl_pref.acquisition import information_gain, score_queries
-from torchrl_pref.belief import Belief, feature_gaps, uniform_sphere
 from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel
 
 
@@ -41,25 +38,14 @@ def main() -> None:
 
 def follow(n_features: int, model: ResponseModel, questions: int, beliefs: int) -> common.Row:
     """One human's answers, many beliefs."""
-    generator, belief = Generator().manual_seed(0), Belief(model)
-    omega = uniform_sphere((n_features,), generator)
-    samples = belief.prior(beliefs, n_features, generator)
-    ess = torch.full((beliefs,), 100.0)
-    gaps = torch.zeros(beliefs, 0, 1, n_features)
-    measured, reported, seconds = [], [], 0.0
-    for _ in tqdm(range(questions), desc=f"D={n_features}, {model}", unit="question"):
+
+    def greedy(samples: Tensor, generator: Generator) -> Tensor:
         pool = torch.randn(1000, 2, n_features, generator=generator)
-        values = score_queries(samples[:1], pool[None], model, information_gain)
-        query = pool[int(values.argmax())]
-        answer = model(query @ omega).exp().multinomial(1, generator=generator)
-        newest = feature_gaps(query[None], answer).expand(beliefs, -1, -1)
-        start = time.process_time()
-        samples, ess, _ = belief.update(samples, ess, gaps, newest, generator)
-        seconds += time.process_time() - start
-        gaps = torch.cat([gaps, newest.unsqueeze(1)], 1)
-        variance = samples.double().flatten(0, 1).var(0).sum()
-        measured.append(float(variance / samples.double().mean(1).var(0).sum()))
-        reported.append(float(1 / (1 / ess).mean()))
+        values = score_queries(samples, pool[None], model, information_gain)
+        return pool[int(values.argmax())]
+
+    bar = tqdm([greedy] * questions, desc=f"D={n_features}, {model}", unit="question")
+    measured, reported, seconds, alignment = common.follow(model, n_features, beliefs, bar)
     return {
         "D": n_features,
         "human": "soft" if isinstance(model, Boltzmann) else "hard",
@@ -74,7 +60,7 @@ def follow(n_features: int, model: ResponseModel, questions: int, beliefs: int) 
         if min(measured) < 95
         else 1.0,
         "ms an update": 1000 * seconds / questions / beliefs,
-        "alignment": float((samples @ omega).mean()),
+        "alignment": alignment,
     }
 
 

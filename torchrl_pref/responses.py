@@ -71,6 +71,19 @@ class ResponseModel(ABC):
         """
         return self.log_likelihood(gaps) > -math.inf
 
+    def possible_arc(self, cosine: Tensor, sine: Tensor, raised: Tensor) -> tuple[Tensor, Tensor]:
+        """Ends of the arc around the angle 0 outside of which some answer is impossible.
+
+        Args:
+            cosine, sine, raised: (G …); at the angle θ the gaps of all answers are
+                cosine · cos θ + sine · sin θ + raised, and at 0 each answer is possible.
+
+        Returns:
+            (…) and (…), infinite where no answer is impossible.
+        """
+        end = torch.full_like(cosine[0], math.inf)
+        return -end, end
+
     def __call__(self, returns: Tensor) -> Tensor:
         """Log-probability of each answer.
 
@@ -191,6 +204,20 @@ class Optimal(ResponseModel):
     def agrees(self, gaps: Tensor) -> Tensor:
         """See :meth:`ResponseModel.agrees`: two that differ are never quite equal."""
         return (gaps > self.tolerance).all(-1)
+
+    def possible_arc(self, cosine: Tensor, sine: Tensor, raised: Tensor) -> tuple[Tensor, Tensor]:
+        """See :meth:`ResponseModel.possible_arc`."""
+        raised = raised + self.tolerance
+        # p cos θ + q sin θ + c is zero where tan(θ/2) = (p + c) / (± √(q² + p² - c²) - q).
+        square = sine.square() + cosine.square() - raised.square()
+        root, room = square.clamp(min=0).sqrt(), (cosine + raised).clamp(min=1e-30)
+        cotangents = ((root + sign * sine) / room for sign in (1, -1))
+        one = torch.ones_like(cosine[0])
+        below, above = (
+            2 * torch.atan2(one, cotangent.masked_fill(square <= 0, -math.inf).amax(0))
+            for cotangent in cotangents
+        )
+        return -below, above
 
     def predict(self, leads: Tensor) -> Prediction:
         """See :meth:`ResponseModel.predict`."""

@@ -136,7 +136,12 @@ def _tensor_move(samples: Tensor, poles: Tensor, uniform: Tensor, target: Target
     # Of two features there is but one circle, and going round it reaches every mode.
     arc = (ARC * poles.norm(dim=-1)).clamp(min=0 if meridians else 2 * math.pi, max=2 * math.pi)
     high = place * arc
-    low = high - arc
+    # Where the answers are possible is the same seen from each place there.
+    raised = torch.zeros_like(cosine)
+    raised[-1] += target.slack.unsqueeze(-1)
+    circles = cosine.flatten(0, 1), sine.flatten(0, 1), raised.flatten(0, 1)
+    first, last = target.response_model.possible_arc(*circles)
+    low, high = torch.maximum(high - arc, first), torch.minimum(high, last)
     found = torch.zeros_like(angle, dtype=torch.bool)
     for fraction in fractions:
         proposal = torch.lerp(low, high, fraction)

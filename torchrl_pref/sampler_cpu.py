@@ -134,8 +134,9 @@ def _move_session(
     circles = np.empty((2, len(raised), n_samples))
     for v in range(len(poles)):
         along, height, pole, ends = _aim(places, poles[v], uniform[v], arc)
+        ahead = _products(poles[v], rows)
         circles[0] = gaps
-        _turn_gaps(gaps, circles[1], rows, poles[v], along, height)
+        _turn_gaps(gaps, circles[1], ahead, along, height)
         given = circles, raised, pole, ends, uniform[v], power, n_features - 2
         turn = _search(*given, n_others, hard, tolerance)
         cosine, sine = np.cos(turn), np.sin(turn)
@@ -145,15 +146,11 @@ def _move_session(
         for p in range(poles.shape[1]):
             first, last = _group(p, poles.shape[1], n_samples)
             for d in range(n_features):
-                ahead = poles[v, p, d]
                 for m in range(first, last):
-                    places[d, m] = places[d, m] * cosine[m] + ahead * sine[m]
+                    places[d, m] = places[d, m] * cosine[m] + poles[v, p, d] * sine[m]
             for g in range(len(raised)):
-                ahead = 0.0
-                for d in range(n_features):
-                    ahead += rows[g, d] * poles[v, p, d]
                 for m in range(first, last):
-                    gaps[g, m] = gaps[g, m] * cosine[m] + ahead * sine[m]
+                    gaps[g, m] = gaps[g, m] * cosine[m] + ahead[p, g] * sine[m]
     for m in range(n_samples):
         norm = 0.0
         for d in range(n_features):
@@ -169,19 +166,26 @@ def _group(p: int, n_groups: int, n_samples: int) -> tuple[int, int]:
 
 
 @compiled
-def _turn_gaps(
-    gaps: Array, ahead: Array, rows: Array, poles: Array, along: Array, height: Array
-) -> None:
-    """Fill ``ahead`` (G M) with the gaps of the tangents, from those of the places (G M)."""
-    n_samples = gaps.shape[1]
+def _products(poles: Array, rows: Array) -> Array:
+    """Return gaps (P G) of poles (P D)."""
+    products = np.zeros((len(poles), len(rows)))
     for p in range(len(poles)):
-        first, last = _group(p, len(poles), n_samples)
-        for g in range(len(gaps)):
-            of_pole = 0.0
+        for g in range(len(rows)):
             for d in range(rows.shape[1]):
-                of_pole += rows[g, d] * poles[p, d]
+                products[p, g] += rows[g, d] * poles[p, d]
+    return products
+
+
+@compiled
+def _turn_gaps(gaps: Array, sideways: Array, ahead: Array, along: Array, height: Array) -> None:
+    """Fill ``sideways`` (G M) with the gaps of the tangents, from those of the places (G M) and of
+    the poles (P G)."""
+    n_samples = gaps.shape[1]
+    for p in range(len(ahead)):
+        first, last = _group(p, len(ahead), n_samples)
+        for g in range(len(gaps)):
             for m in range(first, last):
-                ahead[g, m] = (of_pole - along[m] * gaps[g, m]) / height[m]
+                sideways[g, m] = (ahead[p, g] - along[m] * gaps[g, m]) / height[m]
 
 
 @compiled
@@ -232,6 +236,8 @@ def _search(
     for m in range(n):
         level[m] = power * level[m] - meridians * _log(abs(pole[1, m]))
         level[m] = min(level[m] - _log(1.0 - uniform[m, 1]), 1e300)  # the impossible stays above
+    if hard:
+        _cut_arcs(ends, circles, raised, tolerance)
     left, refused = np.arange(n), np.empty(n, np.int64)
     for i in range(2, uniform.shape[1]):
         for j in range(n):
@@ -256,6 +262,27 @@ def _search(
                 circles[0, g, j] = circles[0, g, refused[j]]
                 circles[1, g, j] = circles[1, g, refused[j]]
     return turn
+
+
+@compiled
+def _cut_arcs(ends: Array, circles: Array, raised: Array, tolerance: float) -> None:
+    """Cut arcs with ends (2 M) to where answers without error are possible, see
+    ``responses.ResponseModel.possible_arc``."""
+    n_samples = circles.shape[2]
+    # Of one over the tangent of half an angle, as far as each end may go.
+    above, below = np.full(n_samples, -math.inf), np.full(n_samples, -math.inf)
+    for g in range(len(raised)):
+        c = raised[g] + tolerance
+        for m in range(n_samples):
+            p, q = circles[0, g, m], circles[1, g, m]
+            square = q * q + p * p - c * c
+            root = math.sqrt(max(square, 0.0))
+            room = max(p + c, 1e-300)
+            above[m] = max(above[m], (root - q) / room if square > 0 else -math.inf)
+            below[m] = max(below[m], (root + q) / room if square > 0 else -math.inf)
+    for m in range(n_samples):
+        ends[0, m] = max(ends[0, m], -2 * math.atan2(1.0, below[m]))
+        ends[1, m] = min(ends[1, m], 2 * math.atan2(1.0, above[m]))
 
 
 @compiled

@@ -19,14 +19,14 @@ from omegaconf import DictConfig
 import app
 import typed
 from torchrl_pref import runs
+from torchrl_pref.config.settings import check_evaluate_settings
 from torchrl_pref.errors import InputError, one_line_errors
 from torchrl_pref.runs import CHECKPOINT
-from torchrl_pref.settings import check_evaluate_settings
 
 if TYPE_CHECKING:
-    from torchrl_pref.checkpoint import Checkpoint
-    from torchrl_pref.comparison import Panels
-    from torchrl_pref.progress import Progress
+    from torchrl_pref.checkpoints.checkpoint import Checkpoint
+    from torchrl_pref.evaluation.comparison import Panels
+    from torchrl_pref.training.progress import Progress
 
 PROTOCOL_KEYS = (
     "checkpoint",
@@ -89,7 +89,8 @@ def check(settings: dict[str, Any]) -> None:
 
 def evaluate(settings: dict[str, Any], folder: Path) -> None:
     """What the settings ask for, reported in a folder."""
-    from torchrl_pref import reports, training_report
+    from torchrl_pref.evaluation import reports
+    from torchrl_pref.training import figure
 
     app.use_threads(settings)
     named = settings["checkpoint"]
@@ -104,7 +105,7 @@ def evaluate(settings: dict[str, Any], folder: Path) -> None:
         paths = find_checkpoints([str(name) for name in listed(named)])
         panels, trained = evaluate_checkpoints(settings, paths)
         reports.write_report(folder, panels)
-        training_report.write_training(folder, trained)
+        figure.write_training(folder, trained)
 
 
 def listed(value: Any) -> list[Any]:
@@ -116,11 +117,12 @@ def evaluate_taus(
     settings: dict[str, Any], learned_for: Callable[[Any], dict[str, Checkpoint]]
 ) -> Panels:
     """The baselines and what was learned for each tau, a panel each."""
-    from torchrl_pref import comparison, experiment
+    from torchrl_pref import build
+    from torchrl_pref.evaluation import comparison
 
-    pools = experiment.make_pools(settings)
+    pools = build.make_pools(settings)
     taus = listed(settings["tau"])
-    tasks = [(experiment.make_task(*pools, tau), learned_for(tau)) for tau in taus]
+    tasks = [(build.make_task(*pools, tau), learned_for(tau)) for tau in taus]
     panels: Panels = {}
     for task, learned in tasks:
         panels |= comparison.evaluate_panels(settings, task, learned)
@@ -129,7 +131,7 @@ def evaluate_taus(
 
 def pretrained_for(settings: dict[str, Any], tau: Any) -> dict[str, Checkpoint]:
     """The policy that comes with the package for a tau, under the settings of this evaluation."""
-    from torchrl_pref.comparison import label_of
+    from torchrl_pref.evaluation.comparison import label_of
     from torchrl_pref.pretrained import pretrained_checkpoint
 
     checkpoint = pretrained_checkpoint(settings["setup"]["name"], tau)
@@ -140,8 +142,8 @@ def pretrained_for(settings: dict[str, Any], tau: Any) -> dict[str, Checkpoint]:
 
 def run_heldout(settings: dict[str, Any], folder: Path) -> None:
     """The held-out protocol, for checkpoints or for the policies that come with the package."""
-    from torchrl_pref import heldout, heldout_report
-    from torchrl_pref.checkpoint import Checkpoint
+    from torchrl_pref.checkpoints.checkpoint import Checkpoint
+    from torchrl_pref.evaluation import heldout, heldout_report
     from torchrl_pref.pretrained import SEEDS, pretrained_checkpoint
 
     learned: dict[heldout.Cell, list[Checkpoint]] = {}
@@ -183,9 +185,11 @@ def evaluate_checkpoints(
 ) -> tuple[Panels, dict[str, Progress]]:
     """Learned policies beside random and greedy, a panel for each kind of human, and the trainings
     behind them."""
-    from torchrl_pref import comparison, experiment
-    from torchrl_pref.checkpoint import Checkpoint
-    from torchrl_pref.queries import QueryPool
+    from torchrl_pref import build
+    from torchrl_pref.checkpoints.checkpoint import Checkpoint
+    from torchrl_pref.evaluation import comparison
+    from torchrl_pref.pool import QueryPool
+    from torchrl_pref.training.progress import Progress
 
     runs = []
     common = Path(os.path.commonpath([path.parent.parent for path in paths]))
@@ -197,7 +201,7 @@ def evaluate_checkpoints(
         pools = path.with_name("train_pool.pt"), path.with_name("test_pool.pt")
         named = path.parent if path.name == CHECKPOINT else path.with_suffix("")
         name = str(named.relative_to(common))
-        runs.append((name, checkpoint, experiment.reload_task(checkpoint, *pools)))
+        runs.append((name, checkpoint, build.reload_task(checkpoint, *pools)))
     panels: Panels = {}
     for panel_settings, task, learned in comparison.group_checkpoints(runs):
         test = None
@@ -208,7 +212,7 @@ def evaluate_checkpoints(
     trained = {}
     for title, (name, checkpoint, _) in zip(titles, runs, strict=True):
         unique = title if titles.count(title) == 1 else f"{title}, {name}"
-        trained[unique] = checkpoint.progress
+        trained[unique] = Progress.of(checkpoint.training)
     return panels, trained
 
 

@@ -16,16 +16,16 @@ from omegaconf import DictConfig, OmegaConf
 import app
 import typed
 from torchrl_pref import runs, sweeps
+from torchrl_pref.config.memory import check_memory
+from torchrl_pref.config.settings import check_run, check_train_settings
 from torchrl_pref.errors import InputError
-from torchrl_pref.memory import check_memory
 from torchrl_pref.runs import CHECKPOINT
-from torchrl_pref.settings import check_run, check_train_settings
-from torchrl_pref.writing import write_text
+from torchrl_pref.storage.writing import write_text
 
 if TYPE_CHECKING:
-    from torchrl_pref.checkpoint import Checkpoint
-    from torchrl_pref.experiment import Task
-    from torchrl_pref.training import Trainer
+    from torchrl_pref.build import Task
+    from torchrl_pref.checkpoints.checkpoint import Checkpoint
+    from torchrl_pref.training.a2c import Trainer
 
 CONFIG = "config.yaml"
 POOLS = ("train_pool.pt", "test_pool.pt")
@@ -86,7 +86,7 @@ def run_folder(path: Path) -> Path:
     Raises:
         InputError: there is none.
     """
-    from torchrl_pref.checkpoint import Checkpoint
+    from torchrl_pref.checkpoints.checkpoint import Checkpoint
 
     if path.is_file():
         check_trained(path, Checkpoint.load(path))
@@ -155,20 +155,22 @@ def begin(folder: Path, settings: dict[str, Any]) -> float:
 
 def start(folder: Path, settings: dict[str, Any]) -> float:
     """The first update of a run, and all that follow."""
-    from torchrl_pref import comparison, experiment
-    from torchrl_pref.checkpoint import Checkpoint
+    from torchrl_pref import build
+    from torchrl_pref.checkpoints.checkpoint import Checkpoint
+    from torchrl_pref.evaluation import comparison
+    from torchrl_pref.training.start import make_trainer
 
     app.use_threads(settings)
-    pools = experiment.make_pools(settings)
+    pools = build.make_pools(settings)
     check_memory(settings, *pools[0].features.shape)
-    task = experiment.make_task(*pools, settings["tau"])
-    trainer = experiment.make_trainer(settings, task)
+    task = build.make_task(*pools, settings["tau"])
+    trainer = make_trainer(settings, task)
     comparison.check_evaluation(settings)
     source = settings["checkpoint"]
     if source is not None:
         checkpoint = Checkpoint.load(source)
         checkpoint.check_fits(task.train, own_indices=True)
-        experiment.load_weights(trainer.policy, checkpoint)
+        build.load_weights(trainer.policy, checkpoint)
         trainer.start_average()
     with app.resumable(folder):
         write_text(folder / CONFIG, OmegaConf.to_yaml(OmegaConf.create(settings)))
@@ -180,8 +182,9 @@ def start(folder: Path, settings: dict[str, Any]) -> float:
 
 def go_on(folder: Path, new: dict[str, Any]) -> float:
     """An old run, from its last checkpoint or its start, with its own settings."""
-    from torchrl_pref import experiment
-    from torchrl_pref.checkpoint import Checkpoint
+    from torchrl_pref import build
+    from torchrl_pref.checkpoints.checkpoint import Checkpoint
+    from torchrl_pref.training.start import make_trainer
 
     checkpoint = Checkpoint.load(folder) if (folder / CHECKPOINT).exists() else None
     settings = load_config(folder) if checkpoint is None else checkpoint.settings
@@ -200,9 +203,9 @@ def go_on(folder: Path, new: dict[str, Any]) -> float:
         return start(folder, settings)
     check_trained(folder, checkpoint)
     app.use_threads(settings)
-    task = experiment.reload_task(checkpoint, *(folder / name for name in POOLS))
-    trainer = experiment.make_trainer(settings, task)
-    experiment.load_weights(trainer.policy, checkpoint)
+    task = build.reload_task(checkpoint, *(folder / name for name in POOLS))
+    trainer = make_trainer(settings, task)
+    build.load_weights(trainer.policy, checkpoint)
     trainer.load_state_dict(checkpoint.training)
     done, updates = trainer.progress.update, settings["training"]["updates"]
     if done >= updates:
@@ -226,8 +229,10 @@ def check_trained(path: Path, checkpoint: Checkpoint) -> None:
 
 def train(folder: Path, settings: dict[str, Any], task: Task, trainer: Trainer) -> float:
     """Train, evaluate on the held-out pool, report."""
-    from torchrl_pref import comparison, experiment, reports, training_report
-    from torchrl_pref.learning_curve import LearningCurve
+    from torchrl_pref.evaluation import comparison, reports
+    from torchrl_pref.training import figure
+    from torchrl_pref.training.learning_curve import LearningCurve
+    from torchrl_pref.training.start import make_checkpoint
 
     setup = settings["setup"]["name"]
     print(f"{setup} setup, {task.title}, run folder {folder}")
@@ -239,14 +244,14 @@ def train(folder: Path, settings: dict[str, Any], task: Task, trainer: Trainer) 
         )
 
     def save() -> None:
-        experiment.make_checkpoint(settings, task, trainer).save(folder / CHECKPOINT)
+        make_checkpoint(settings, task, trainer).save(folder / CHECKPOINT)
 
     trainer.run(folder, save, LearningCurve(settings, task, trainer).measure)
     label = comparison.label_of(settings)
-    learned = {label: experiment.make_checkpoint(settings, task, trainer)}
+    learned = {label: make_checkpoint(settings, task, trainer)}
     panels = comparison.evaluate_panels(settings, task, learned)
     reports.write_report(folder, panels)
-    training_report.write_training(folder, {label: trainer.progress})
+    figure.write_training(folder, {label: trainer.progress})
     held_out = next(iter(panels.values()))[label]
     return sweeps.write_summary(folder, settings["overrides"], held_out)
 

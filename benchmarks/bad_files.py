@@ -43,12 +43,14 @@ from omegaconf import OmegaConf
 
 from benchmarks import common, spoil, spoil_contents, spoil_hostile
 from benchmarks.spoil import MARKER, Case
-from torchrl_pref import comparison, experiment
-from torchrl_pref.checkpoint import KIND, Checkpoint
+from torchrl_pref import build
+from torchrl_pref.checkpoints.checkpoint import KIND, Checkpoint
 from torchrl_pref.errors import InputError, check_count
-from torchrl_pref.files import MAX_FILE
-from torchrl_pref.queries import QueryPool
-from torchrl_pref.training import Trainer
+from torchrl_pref.evaluation import comparison
+from torchrl_pref.pool import QueryPool
+from torchrl_pref.storage.files import MAX_FILE
+from torchrl_pref.training.a2c import Trainer
+from torchrl_pref.training.start import make_checkpoint, make_trainer
 
 OUTCOMES = ("refused", "harmless", "accepted", "traceback", "hang", "crash", "memory", "executed")
 COLUMNS = ("tried", *OUTCOMES, "changed")
@@ -120,14 +122,14 @@ def make_run(folder: Path) -> None:
     for key in ("resume", "checkpoint"):
         settings.pop(key)
     settings["overrides"] = list(SIZES)
-    pools = experiment.make_pools(settings)
-    task = experiment.make_task(*pools, settings["tau"])
-    trainer = experiment.make_trainer(settings, task)
+    pools = build.make_pools(settings)
+    task = build.make_task(*pools, settings["tau"])
+    trainer = make_trainer(settings, task)
     folder.mkdir(parents=True)
     pools[0].save(folder / "train_pool.pt")
 
     def save() -> None:
-        experiment.make_checkpoint(settings, task, trainer).save(folder / "checkpoint.pt")
+        make_checkpoint(settings, task, trainer).save(folder / "checkpoint.pt")
 
     with contextlib.redirect_stderr(io.StringIO()):
         trainer.run(folder, save)
@@ -138,10 +140,10 @@ def resumed(checkpoint: Checkpoint) -> Trainer:
     settings = checkpoint.settings
     check_count("threads", settings["threads"], 1)
     comparison.check_evaluation(settings)
-    task = experiment.reload_task(checkpoint, Path("none"), Path("none"))
+    task = build.reload_task(checkpoint, Path("none"), Path("none"))
     checkpoint.check_fits(task.test)
-    trainer = experiment.make_trainer(settings, task)
-    experiment.load_weights(trainer.policy, checkpoint)
+    trainer = make_trainer(settings, task)
+    build.load_weights(trainer.policy, checkpoint)
     if "optimizer" not in checkpoint.training:
         raise InputError("a policy without the state of its training")
     trainer.load_state_dict(checkpoint.training)

@@ -305,7 +305,7 @@ def _import_heavy() -> None:
     """Once, and not in each fork."""
     import torch
 
-    import torchrl_pref.heldout_report  # noqa: F401
+    import torchrl_pref.evaluation.heldout_report  # noqa: F401
 
     torch.set_num_threads(1)
 
@@ -339,12 +339,14 @@ def _be_command(script: str, arguments: Sequence[str], work: Path) -> None:
 
 def _stop_at_work() -> None:
     """What is legal ends where it would start to train or to evaluate, on a machine of 4 GB."""
-    from torchrl_pref import comparison, heldout, memory, training
+    from torchrl_pref.config import memory
+    from torchrl_pref.evaluation import comparison, heldout
+    from torchrl_pref.training.a2c import Trainer
 
     def stop(*_: Any, **__: Any) -> None:
         os._exit(STARTED)
 
-    training.Trainer.run = stop  # type: ignore[assignment, method-assign]
+    Trainer.run = stop  # type: ignore[assignment, method-assign]
     comparison.evaluate_panels = stop  # type: ignore[assignment]
     heldout.run_protocol = stop  # type: ignore[assignment]
     memory.machine_memory = lambda: LIMIT_BYTES

@@ -28,9 +28,10 @@ import torch
 from torch import Generator, Tensor
 
 from benchmarks import common, peers
-from torchrl_pref.acquisition import information_gain, score_queries
-from torchrl_pref.belief import Belief, feature_gaps, uniform_sphere
-from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel
+from torchrl_pref.acquisition.functions import information_gain
+from torchrl_pref.acquisition.scoring import score_queries
+from torchrl_pref.beliefs.sampled import Belief, feature_gaps, uniform_sphere
+from torchrl_pref.questions.responses import Boltzmann, Optimal, ResponseModel
 
 ANSWERS = (1, 5, 10, 20)
 REPETITIONS = 200

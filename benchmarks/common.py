@@ -20,11 +20,11 @@ import torch
 from tabulate import tabulate
 from torch import Generator, Tensor
 
-from torchrl_pref.belief import Belief, feature_gaps, uniform_sphere
+from torchrl_pref.beliefs.sampled import Belief, feature_gaps, uniform_sphere
 from torchrl_pref.compiled import share_out
-from torchrl_pref.features import Normalizer
-from torchrl_pref.queries import QueryPool, gridworld_pool
-from torchrl_pref.responses import ResponseModel
+from torchrl_pref.pool import Normalizer, QueryPool
+from torchrl_pref.questions.responses import ResponseModel
+from torchrl_pref.tasks.gridworld import gridworld_pool
 
 TAU = 4.5
 """About what ``tau=noisy`` solves to on the default pool."""

@@ -18,8 +18,9 @@ from torch import Generator, Tensor
 from tqdm import tqdm
 
 from benchmarks import common
-from torchrl_pref.acquisition import information_gain, score_queries
-from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel
+from torchrl_pref.acquisition.functions import information_gain
+from torchrl_pref.acquisition.scoring import score_queries
+from torchrl_pref.questions.responses import Boltzmann, Optimal, ResponseModel
 
 
 def main() -> None:

@@ -39,7 +39,8 @@ import torch
 from tabulate import tabulate
 
 import train  # noqa: F401  (forked processes need not import it)
-from torchrl_pref.checkpoint import Checkpoint
+from torchrl_pref.checkpoints.checkpoint import Checkpoint
+from torchrl_pref.training.progress import Progress
 
 TINY = [
     *("belief.samples=10", "belief.moves=1", "pool.size=50", "setup.budget=3"),
@@ -111,7 +112,7 @@ def kill_at(work: str, count: int) -> Callable[[], None]:
     or when a file is written but has not yet its name."""
 
     def set_trap() -> None:
-        from torchrl_pref import comparison
+        from torchrl_pref.evaluation import comparison
 
         module, name = (os, "replace") if work == "write" else (comparison, "evaluate")
         function, calls = getattr(module, name), itertools.count(1)
@@ -142,7 +143,9 @@ def content(folder: Path) -> dict[str, Any]:
     """All that a run leaves and that is not a time."""
     checkpoint = Checkpoint.load(folder)
     training = dict(checkpoint.training)
-    training["history"] = {k: v for k, v in checkpoint.progress.history.items() if "time/" not in k}
+    training["history"] = {
+        k: v for k, v in Progress.of(checkpoint.training).history.items() if "time/" not in k
+    }
     tables = (folder / "tables.txt").read_text()
     with (folder / "training.csv").open() as file:
         rows = list(csv.DictReader(file))

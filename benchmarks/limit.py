@@ -21,12 +21,13 @@ import torch
 from torch import Generator, Tensor
 
 from benchmarks import common
-from torchrl_pref.acquisition import information_gain, predict_answers, score_queries
-from torchrl_pref.belief import Belief, feature_gaps, uniform_sphere
-from torchrl_pref.resampling import FRAMES, poles_of
-from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel, compiled_constants
-from torchrl_pref.sampler import ARC, MAX_SHRINKS
-from torchrl_pref.sampler_cpu import compiled_moves
+from torchrl_pref.acquisition.functions import information_gain
+from torchrl_pref.acquisition.scoring import predict_answers, score_queries
+from torchrl_pref.beliefs.resampling import FRAMES, poles_of
+from torchrl_pref.beliefs.sampled import Belief, feature_gaps, uniform_sphere
+from torchrl_pref.beliefs.slice import ARC, MAX_SHRINKS
+from torchrl_pref.beliefs.slice_cpu import compiled_moves
+from torchrl_pref.questions.responses import Boltzmann, Optimal, ResponseModel, compiled_constants
 
 SESSIONS, MOVES = 100, 4
 

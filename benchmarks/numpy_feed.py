@@ -18,7 +18,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from torchrl_pref.sampler import ARC, MAX_SHRINKS
+from torchrl_pref.beliefs.slice import ARC, MAX_SHRINKS
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
 

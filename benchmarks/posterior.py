@@ -31,9 +31,10 @@ from tqdm import tqdm
 
 from benchmarks import common
 from tests.posterior import Posterior, posterior
-from torchrl_pref.acquisition import information_gain, score_queries
-from torchrl_pref.belief import Belief, feature_gaps, uniform_sphere
-from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel
+from torchrl_pref.acquisition.functions import information_gain
+from torchrl_pref.acquisition.scoring import score_queries
+from torchrl_pref.beliefs.sampled import Belief, feature_gaps, uniform_sphere
+from torchrl_pref.questions.responses import Boltzmann, Optimal, ResponseModel
 
 BOUND = 0.02
 

@@ -26,21 +26,17 @@ from torch import Tensor
 from tqdm import tqdm
 
 from benchmarks import common
-from torchrl_pref.checkpoint import Checkpoint
-from torchrl_pref.comparison import FIRST_EVALUATION_SEED
-from torchrl_pref.envs import FeedEnv, QueryEnv
-from torchrl_pref.evaluation import draw_humans
-from torchrl_pref.experiment import (
-    load_policy,
-    make_feed_env,
-    make_pools,
-    make_query_env,
-    make_task,
-)
-from torchrl_pref.heldout import Cell, run_side_by_side, two_way_interval
+from torchrl_pref.build import load_policy, make_feed_env, make_pools, make_query_env, make_task
+from torchrl_pref.checkpoints.checkpoint import Checkpoint
+from torchrl_pref.envs.feed import FeedEnv
+from torchrl_pref.envs.query import QueryEnv
+from torchrl_pref.evaluation.comparison import FIRST_EVALUATION_SEED
+from torchrl_pref.evaluation.heldout import Cell, run_side_by_side
+from torchrl_pref.evaluation.reports import signed
+from torchrl_pref.evaluation.run import draw_humans
+from torchrl_pref.evaluation.statistics import two_way_interval
 from torchrl_pref.pretrained import SEEDS, pretrained_checkpoint
-from torchrl_pref.queries import gridworld_pool
-from torchrl_pref.reports import signed
+from torchrl_pref.tasks.gridworld import gridworld_pool
 
 FIRST_SEED = FIRST_EVALUATION_SEED + 60_000
 """Of the pools and humans; another one by ``--seed``, to tune on."""

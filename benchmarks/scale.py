@@ -28,9 +28,10 @@ import torch
 from torch import Generator
 
 from benchmarks.common import TAU, Row, arguments, belief_samples, devices, paired, report, start
-from torchrl_pref.acquisition import information_gain, score_queries
-from torchrl_pref.belief import Belief, feature_gaps, uniform_sphere
-from torchrl_pref.responses import Boltzmann
+from torchrl_pref.acquisition.functions import information_gain
+from torchrl_pref.acquisition.scoring import score_queries
+from torchrl_pref.beliefs.sampled import Belief, feature_gaps, uniform_sphere
+from torchrl_pref.questions.responses import Boltzmann
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt

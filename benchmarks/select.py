@@ -21,8 +21,9 @@ import torch
 from torch import Tensor
 
 from benchmarks import common, peers
-from torchrl_pref.acquisition import information_gain, score_queries
-from torchrl_pref.responses import Boltzmann
+from torchrl_pref.acquisition.functions import information_gain
+from torchrl_pref.acquisition.scoring import score_queries
+from torchrl_pref.questions.responses import Boltzmann
 
 BATCH = 100
 """Sessions of the batched case."""

@@ -19,12 +19,12 @@ import numpy as np
 from tensordict.nn import TensorDictModuleBase
 
 from benchmarks import common, peers
-from torchrl_pref.belief import Belief
-from torchrl_pref.envs import QueryEnv
-from torchrl_pref.evaluation import draw_humans, evaluate
-from torchrl_pref.humans import SimulatedHuman
-from torchrl_pref.policies import scorer_policy
-from torchrl_pref.responses import Boltzmann, Optimal
+from torchrl_pref.beliefs.sampled import Belief
+from torchrl_pref.envs.query import QueryEnv
+from torchrl_pref.evaluation.run import draw_humans, evaluate
+from torchrl_pref.humans.simulated import SimulatedHuman
+from torchrl_pref.policies.scorer import scorer_policy
+from torchrl_pref.questions.responses import Boltzmann, Optimal
 from torchrl_pref.strategies import Greedy, RandomQuery
 
 HUMANS, BUDGET = 100, 20

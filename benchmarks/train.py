@@ -32,13 +32,13 @@ import torch
 from omegaconf import OmegaConf
 
 from benchmarks import common
-from torchrl_pref.belief import Belief
-from torchrl_pref.envs import FeedEnv
-from torchrl_pref.humans import SimulatedHuman
-from torchrl_pref.policies import paper_policy
-from torchrl_pref.responses import Boltzmann
+from torchrl_pref.beliefs.sampled import Belief
+from torchrl_pref.envs.feed import FeedEnv
+from torchrl_pref.humans.simulated import SimulatedHuman
+from torchrl_pref.policies.paper import paper_policy
+from torchrl_pref.questions.responses import Boltzmann
 from torchrl_pref.strategies import RandomAsk
-from torchrl_pref.training import A2CSettings, Trainer
+from torchrl_pref.training.a2c import A2CSettings, Trainer
 
 COUNTS = (1, 8, 64, 256)
 PAPER = Path(__file__).parents[1] / "conf" / "experiment" / "paper.yaml"

@@ -64,14 +64,15 @@ def measure() -> dict[str, float]:
     """CPU seconds of each part, with names that both versions know."""
     import torch
 
-    from torchrl_pref.acquisition import information_gain
-    from torchrl_pref.belief import Belief, feature_gaps, uniform_sphere
-    from torchrl_pref.envs import FeedEnv, QueryEnv
-    from torchrl_pref.features import Normalizer
-    from torchrl_pref.humans import SimulatedHuman
-    from torchrl_pref.queries import gridworld_pool
-    from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel
+    from torchrl_pref.acquisition.functions import information_gain
+    from torchrl_pref.beliefs.sampled import Belief, feature_gaps, uniform_sphere
+    from torchrl_pref.envs.feed import FeedEnv
+    from torchrl_pref.envs.query import QueryEnv
+    from torchrl_pref.humans.simulated import SimulatedHuman
+    from torchrl_pref.pool import Normalizer
+    from torchrl_pref.questions.responses import Boltzmann, Optimal, ResponseModel
     from torchrl_pref.strategies import Greedy
+    from torchrl_pref.tasks.gridworld import gridworld_pool
 
     torch.set_num_threads(1)
     pool = gridworld_pool()

@@ -2,10 +2,10 @@ import pytest
 import torch
 from torch import Generator
 
-from torchrl_pref.belief import Belief
-from torchrl_pref.features import Normalizer
-from torchrl_pref.queries import QueryPool, gridworld_pool
-from torchrl_pref.responses import Boltzmann, Optimal
+from torchrl_pref.beliefs.sampled import Belief
+from torchrl_pref.pool import Normalizer, QueryPool
+from torchrl_pref.questions.responses import Boltzmann, Optimal
+from torchrl_pref.tasks.gridworld import gridworld_pool
 
 torch.set_num_threads(1)
 

@@ -19,9 +19,10 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from torch import Tensor
 
-from torchrl_pref.comparison import compare, label_of
-from torchrl_pref.experiment import make_pools, make_task, make_trainer
+from torchrl_pref.build import make_pools, make_task
+from torchrl_pref.evaluation.comparison import compare, label_of
 from torchrl_pref.pretrained import pretrained_checkpoint
+from torchrl_pref.training.start import make_trainer
 
 ROOT = Path(__file__).resolve().parents[1]
 FILE = Path(__file__).with_suffix(".json")

@@ -20,8 +20,10 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_pref.checkpoint import Checkpoint
-from torchrl_pref.queries import QueryPool, gridworld_pool
+from torchrl_pref.checkpoints.checkpoint import Checkpoint
+from torchrl_pref.pool import QueryPool
+from torchrl_pref.tasks.gridworld import gridworld_pool
+from torchrl_pref.training.progress import Progress
 
 ROOT = Path(__file__).parent.parent
 
@@ -72,8 +74,8 @@ def test_train_evaluate_and_resume(tmp_path: Path) -> None:
 
     output = run("train.py", f"resume={folder}", "training.updates=5", cwd=tmp_path)
     assert str(folder) in output
-    assert Checkpoint.load(folder).progress.update == 5
-    assert sorted(Checkpoint.load(folder).progress.held_out) == [0, 2, 3, 5]
+    assert Progress.of(Checkpoint.load(folder).training).update == 5
+    assert sorted(Progress.of(Checkpoint.load(folder).training).held_out) == [0, 2, 3, 5]
     assert "RL-feed: alignment with 6 held-out humans" in output
 
 

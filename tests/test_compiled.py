@@ -13,10 +13,11 @@ import pytest
 import torch
 from numba import config
 
-from torchrl_pref.acquisition import information_gain, score_queries
-from torchrl_pref.belief import Belief
+from torchrl_pref.acquisition.functions import information_gain
+from torchrl_pref.acquisition.scoring import score_queries
+from torchrl_pref.beliefs.sampled import Belief
 from torchrl_pref.compiled import FEWEST, over_sessions, share_out
-from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel
+from torchrl_pref.questions.responses import Boltzmann, Optimal, ResponseModel
 
 FAR_FROM_HERE = """
 from torchrl_pref.compiled import compiled

@@ -19,10 +19,10 @@ from test_cli import ROOT, TINY, run, start
 
 import app
 from torchrl_pref import sweeps
-from torchrl_pref.checkpoint import Checkpoint
+from torchrl_pref.checkpoints.checkpoint import Checkpoint
 from torchrl_pref.errors import InputError
 from torchrl_pref.runs import claimed
-from torchrl_pref.writing import PARTIAL, replacing, write_text
+from torchrl_pref.storage.writing import PARTIAL, replacing, write_text
 
 
 @contextlib.contextmanager

@@ -4,20 +4,17 @@ import numpy as np
 import pytest
 import torch
 from conftest import RESPONSE_MODELS
-from test_envs import make
-from test_policies import session_of
+from helpers import make, session_of
 from torch import Generator, Tensor
 
-from torchrl_pref.acquisition import (
-    alignment_gain,
-    information_gain,
-    predict_answers,
-)
-from torchrl_pref.envs import FeedEnv, QueryEnv
+from torchrl_pref.acquisition.functions import alignment_gain, information_gain
+from torchrl_pref.acquisition.scoring import predict_answers
+from torchrl_pref.envs.feed import FeedEnv
+from torchrl_pref.envs.objectives import make_objective
+from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.errors import InputError
-from torchrl_pref.objectives import make_objective
-from torchrl_pref.queries import QueryPool
-from torchrl_pref.responses import Prediction, ResponseModel
+from torchrl_pref.pool import QueryPool
+from torchrl_pref.questions.responses import Prediction, ResponseModel
 from torchrl_pref.strategies import (
     REFERENCE,
     Greedy,

@@ -1,19 +1,20 @@
 """Preference-based reward learning on TorchRL: choose which question to ask a person next.
 
 The names below are imported when they are first used: TorchRL takes seconds, and what only reads
-``torchrl_pref.errors`` or ``torchrl_pref.settings`` does not need it.
+``torchrl_pref.errors`` or ``torchrl_pref.config`` does not need it.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from torchrl_pref.belief import Belief
-    from torchrl_pref.envs import FeedEnv, QueryEnv
-    from torchrl_pref.features import Normalizer
-    from torchrl_pref.humans import SimulatedHuman
-    from torchrl_pref.queries import QueryPool, gridworld_pool
-    from torchrl_pref.responses import Boltzmann, Optimal, ResponseModel, calibrate_tau
+    from torchrl_pref.beliefs.sampled import Belief
+    from torchrl_pref.envs.feed import FeedEnv
+    from torchrl_pref.envs.query import QueryEnv
+    from torchrl_pref.humans.simulated import SimulatedHuman
+    from torchrl_pref.pool import Normalizer, QueryPool
+    from torchrl_pref.questions.responses import Boltzmann, Optimal, ResponseModel, calibrate_tau
+    from torchrl_pref.tasks.gridworld import gridworld_pool
 
 __all__ = [
     "Belief",
@@ -30,12 +31,13 @@ __all__ = [
 ]
 
 _MODULES = {
-    "belief": ("Belief",),
-    "envs": ("FeedEnv", "QueryEnv"),
-    "features": ("Normalizer",),
-    "humans": ("SimulatedHuman",),
-    "queries": ("QueryPool", "gridworld_pool"),
-    "responses": ("Boltzmann", "Optimal", "ResponseModel", "calibrate_tau"),
+    "beliefs.sampled": ("Belief",),
+    "envs.feed": ("FeedEnv",),
+    "envs.query": ("QueryEnv",),
+    "humans.simulated": ("SimulatedHuman",),
+    "pool": ("Normalizer", "QueryPool"),
+    "questions.responses": ("Boltzmann", "Optimal", "ResponseModel", "calibrate_tau"),
+    "tasks.gridworld": ("gridworld_pool",),
 }
 _HOME = {name: module for module, names in _MODULES.items() for name in names}
 

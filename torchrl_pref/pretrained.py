@@ -1,20 +1,22 @@
 """Policies that come with the package, trained for each setup and kind of human.
 
-``torchrl_pref/pretrained/README.md`` is their card: how they were trained, and how they do.
+``torchrl_pref/policies/weights/README.md`` is their card: how they were trained, and how they do.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from torchrl_pref.checkpoint import Checkpoint
-from torchrl_pref.envs import FeedEnv, QueryEnv
+from torchrl_pref.build import load_policy
+from torchrl_pref.checkpoints.checkpoint import Checkpoint
+from torchrl_pref.envs.feed import FeedEnv
+from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.errors import InputError, check_choice, check_count
-from torchrl_pref.experiment import load_policy
-from torchrl_pref.policies import Policy
+from torchrl_pref.policies.base import Policy
 from torchrl_pref.runs import CHECKPOINT
+from torchrl_pref.training.progress import Progress
 
-FOLDER = Path(__file__).parent / "pretrained"
+FOLDER = Path(__file__).parent / "policies" / "weights"
 
 SEEDS = 5
 
@@ -72,7 +74,7 @@ def export(sweep: str | Path) -> list[Path]:
     for path in sorted(Path(sweep).rglob(CHECKPOINT)):
         checkpoint = Checkpoint.load(path)
         settings = checkpoint.settings
-        checkpoint.training = checkpoint.progress.state_dict()
+        checkpoint.training = Progress.of(checkpoint.training).state_dict()
         name = f"{settings['setup']['name']}-{settings['tau']}-{settings['seed']}.pt"
         checkpoint.save(FOLDER / name)
         written.append(FOLDER / name)

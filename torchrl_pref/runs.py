@@ -9,7 +9,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from torchrl_pref.errors import InputError
-from torchrl_pref.writing import PARTIAL
+from torchrl_pref.storage.writing import PARTIAL
 
 LOCK = ".lock"
 

@@ -15,18 +15,12 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Generator, Tensor
 
-from torchrl_pref.acquisition import (
-    Acquisition,
-    information_gain,
-    moments_among,
-    predict_answers,
-    score_queries,
-    together,
-)
-from torchrl_pref.envs import FeedEnv
+from torchrl_pref.acquisition.functions import Acquisition, information_gain
+from torchrl_pref.acquisition.scoring import moments_among, predict_answers, score_queries, together
+from torchrl_pref.beliefs.per_belief import PerBelief
+from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.errors import check_count, check_share
-from torchrl_pref.per_belief import PerBelief
-from torchrl_pref.responses import ResponseModel
+from torchrl_pref.questions.responses import ResponseModel
 
 REFERENCE = 500
 """Queries of the pool among which a feed strategy ranks an offer."""

@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchrl_pref.errors import InputError, one_line
-from torchrl_pref.writing import replacing, write_text
+from torchrl_pref.storage.writing import replacing, write_text
 
 if TYPE_CHECKING:
-    from torchrl_pref.evaluation import Evaluation
+    from torchrl_pref.evaluation.run import Evaluation
 
 SUMMARY, FAILED, TABLE = "summary.json", "failed.json", "summary.csv"
 
@@ -33,7 +33,7 @@ def write_summary(folder: Path, overrides: Sequence[str], result: Evaluation) ->
     Returns:
         :func:`final_alignment`.
     """
-    from torchrl_pref.reports import milestones
+    from torchrl_pref.evaluation.reports import milestones
 
     numbers = {
         f"alignment after {j}": round(float(result.alignment[:, j].mean()), 4)

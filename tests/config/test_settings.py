@@ -1,0 +1,151 @@
+"""What is typed is checked as a whole, before anything is made of it."""
+
+from __future__ import annotations
+
+import copy
+import random
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+import torchrl_pref
+from benchmarks.bad_settings import FAULTS, every_command, run_forked
+from torchrl_pref.beliefs import sampled as belief
+from torchrl_pref.beliefs import slice as sampler
+from torchrl_pref.config import memory, settings
+from torchrl_pref.envs import objectives
+from torchrl_pref.errors import InputError, one_line
+from torchrl_pref.policies import attention
+
+ROOT = Path(__file__).parents[2]
+
+
+def composed(script: str, *overrides: str) -> dict[str, Any]:
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        plain = OmegaConf.to_container(compose(script, list(overrides)))
+    assert isinstance(plain, dict)
+    return {str(key): value for key, value in plain.items()}
+
+
+def test_a_random_sample_of_bad_settings_is_refused_in_one_line() -> None:
+    """``benchmarks/bad_settings.py`` runs all of them."""
+    commands = every_command()
+    assert len(set(commands)) >= 2000
+    results = [run_forked(*one) for one in random.Random(0).sample(commands, 60)]
+    assert [result for result in results if result.outcome in FAULTS] == []
+    assert sum(result.outcome == "refused" for result in results) > 40
+
+
+@pytest.mark.parametrize("setup", ["query", "feed"])
+@pytest.mark.parametrize("policy", ["scorer", "attention", "paper"])
+def test_every_default_of_a_training_is_legal(setup: str, policy: str) -> None:
+    typed = composed("train", f"setup={setup}", f"policy={policy}")
+    settings.check_train_settings(typed)
+    run = {key: value for key, value in typed.items() if key not in ("resume", "checkpoint")}
+    settings.check_run({**run, "overrides": []})
+
+
+@pytest.mark.parametrize("typed", ["setup=query", "setup=feed", "+policy=pretrained"])
+def test_every_default_of_an_evaluation_is_legal(typed: str) -> None:
+    settings.check_evaluate_settings(composed("evaluate", typed.lstrip("+")))
+
+
+def test_moves_may_be_left_to_the_belief() -> None:
+    typed = composed("train")
+    for moves in (None, 1, 16):
+        typed["belief"]["moves"] = moves
+        settings.check_train_settings(typed)
+
+
+def test_words_are_those_of_the_library() -> None:
+    assert set(settings.OBJECTIVES) == set(objectives.OBJECTIVES)
+    for tokens in attention.TOKENS:
+        settings.POLICIES["attention"]["policy.tokens"]("policy.tokens", tokens)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "what"),
+    [
+        ("evaluation.humans", 10**12, "the evaluation"),
+        ("training.sessions", 10**8, "training"),
+        ("belief.samples", 10**9, "training"),
+        ("pool.size", 10**9, "the evaluation"),
+        ("grid.length", 2**32, "the pools"),
+        ("setup.budget", 10**9, "training"),
+        ("training.steps", 10**9, "training"),
+        ("belief.moves", 10**9, "moving the belief"),
+    ],
+)
+def test_what_cannot_fit_is_refused_with_its_estimate(key: str, value: int, what: str) -> None:
+    typed = composed("train")
+    section, name = key.split(".")
+    typed[section][name] = value
+    with pytest.raises(InputError, match=rf"{key}={value}.*: {what} would take about .* GB"):
+        settings.check_train_settings(typed)
+
+
+def test_the_limit_of_memory_is_the_machines(monkeypatch: pytest.MonkeyPatch) -> None:
+    typed = composed("train")
+    monkeypatch.setattr(memory, "machine_memory", lambda: 10**8)
+    with pytest.raises(InputError, match=r"at most the 0.1 GB of this machine"):
+        settings.check_train_settings(typed)
+
+
+def test_a_pool_of_ones_own_counts_as_large_as_it_is() -> None:
+    typed = composed("evaluate")
+    memory.check_memory(typed)
+    with pytest.raises(InputError, match="the evaluation would take"):
+        memory.check_memory(typed, 10**10, 2, 4)
+
+
+@pytest.mark.parametrize("key", ["tau", "seed", "training.gamma", "setup", "policy", "belief"])
+def test_a_missing_key_is_named(key: str) -> None:
+    typed = copy.deepcopy(composed("train"))
+    *sections, name = key.split(".")
+    inner = typed[sections[0]] if sections else typed
+    del inner[name]
+    with pytest.raises(InputError, match=rf"^{key}\S* is missing"):
+        settings.check_train_settings(typed)
+
+
+def test_long_and_unprintable_input_stays_one_short_line() -> None:
+    line = one_line(InputError("tau=" + "x" * 10_000 + "\n\x1b[31mred: expected a number"))
+    assert len(line) < 1300
+    assert line.isprintable()
+    assert line.endswith("expected a number")
+
+
+def test_help_and_the_package_need_nothing_heavy() -> None:
+    heavy = {"torch", "torchrl", "tensordict", "matplotlib", "numba", "tabulate", "tensorboard"}
+    code = f"""
+import runpy, sys
+import torchrl_pref, torchrl_pref.config.settings
+sys.argv = ["train.py", "--help"]
+try:
+    runpy.run_path({str(ROOT / "train.py")!r}, run_name="__main__")
+except SystemExit as ended:
+    assert not ended.code
+print(sorted({heavy!r} & set(sys.modules)), file=sys.stderr)
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.stderr == "[]\n"
+    assert "Train a policy to ask" in done.stdout
+
+
+def test_the_package_gives_its_names_when_they_are_used() -> None:
+    assert set(torchrl_pref.__all__) <= set(dir(torchrl_pref))
+    for name in torchrl_pref.__all__:
+        assert getattr(torchrl_pref, name).__name__ == name
+    with pytest.raises(AttributeError, match="no attribute 'Nothing'"):
+        _ = torchrl_pref.Nothing
+
+
+def test_the_estimate_knows_what_the_belief_does_at_once() -> None:
+    """The estimate is made before anything heavy is imported, so the numbers stand there again."""
+    assert memory.MOVED == belief.MOVED
+    assert memory.UNIFORMS == 2 + sampler.MAX_SHRINKS

@@ -1,0 +1,105 @@
+"""Environments, sessions, settings and trainers that several tests are made with."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from conftest import RESPONSE_MODELS
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
+
+from torchrl_pref.beliefs.sampled import Belief
+from torchrl_pref.build import make_pools, make_task
+from torchrl_pref.envs.feed import FeedEnv
+from torchrl_pref.envs.query import QueryEnv
+from torchrl_pref.humans.simulated import SimulatedHuman
+from torchrl_pref.pool import QueryPool
+from torchrl_pref.questions.responses import ResponseModel
+from torchrl_pref.strategies import RandomAsk, RandomQuery
+from torchrl_pref.training.a2c import Trainer
+from torchrl_pref.training.start import make_trainer
+
+ENVS = [QueryEnv, FeedEnv]
+
+
+def make(
+    kind: type[QueryEnv] | type[FeedEnv],
+    pool: QueryPool,
+    model: ResponseModel = RESPONSE_MODELS[0],
+    batch: int = 4,
+    **options: object,
+) -> QueryEnv | FeedEnv:
+    belief = Belief(model, samples=20, moves=2)
+    options = {"budget": 5, "batch_size": (batch,), **options}
+    return kind(pool, SimulatedHuman(model), belief, **options)  # type: ignore[arg-type]
+
+
+def coin(env: QueryEnv | FeedEnv, seed: int = 0) -> TensorDictModule:
+    return RandomQuery(seed) if isinstance(env, QueryEnv) else RandomAsk(0.5, seed)
+
+
+def session_of(env: QueryEnv | FeedEnv) -> TensorDictBase:
+    """A session after one answer."""
+    ask = RandomQuery() if isinstance(env, QueryEnv) else RandomAsk()
+    return env.rollout(1, ask)[:, -1]["next"].exclude("reward")
+
+
+def settings_of(setup: str = "feed", policy: str = "scorer", **training: Any) -> dict[str, Any]:
+    return {
+        "tau": "noisy",
+        "seed": 0,
+        "device": "cpu",
+        "threads": 1,
+        "overrides": [],
+        "objective": "alignment",
+        "skip": "free",
+        "tau_spread": 1,
+        "grid": {"size": 8, "length": 20},
+        "pool": {"size": 30, "options": 2, "seed": 0, "train": None, "test": None},
+        "belief": {"samples": 10, "moves": 1},
+        "evaluation": {"humans": 5, "seed": 1},
+        "policy": {"name": policy, "sample": False, "start": None, "tokens": "samples"},
+        "setup": {
+            "name": setup,
+            "budget": 4,
+            "offers": None,
+            "on_skip": "new",
+            "candidates": 8,
+            "repeats": True,
+        },
+        "training": {
+            "updates": 6,
+            "sessions": 4,
+            # Not a divisor of the episode, so that batches end in mid-session.
+            "steps": 3,
+            "optimizer": "rmsprop",
+            "learning_rate": 0.01,
+            "gamma": 0.99,
+            "lmbda": 0.95,
+            "entropy": 0.01,
+            "critic": 0.5,
+            "critic_steps": 2,
+            "grad_norm": 0.5,
+            "warm_up": 1,
+            "average": 0.9,
+            "save_every": 2,
+            **training,
+        },
+    }
+
+
+def trainer_of(settings: dict[str, Any]) -> tuple[Trainer, Any]:
+    task = make_task(*make_pools(settings), settings["tau"])
+    return make_trainer(settings, task), task
+
+
+def same(first: Any, second: Any) -> bool:
+    """Whether two nests of plain data and tensors are equal to the last bit; NaN equals NaN."""
+    if isinstance(first, dict):
+        return first.keys() == second.keys() and all(same(first[k], second[k]) for k in first)
+    if isinstance(first, (list, tuple)):
+        return len(first) == len(second) and all(map(same, first, second))
+    if isinstance(first, torch.Tensor):
+        return torch.equal(first.nan_to_num(7.5), second.nan_to_num(7.5))
+    return bool(first == second) or (first != first and second != second)

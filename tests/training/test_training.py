@@ -1,0 +1,273 @@
+from __future__ import annotations
+
+import copy
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from helpers import same, settings_of, trainer_of
+from tensordict import TensorDict
+
+from torchrl_pref.build import load_weights, reload_task
+from torchrl_pref.checkpoints.checkpoint import Checkpoint
+from torchrl_pref.errors import InputError
+from torchrl_pref.pool import QueryPool
+from torchrl_pref.tasks.gridworld import gridworld_pool
+from torchrl_pref.training.a2c import _explained_variance
+from torchrl_pref.training.start import make_checkpoint
+
+
+@pytest.mark.parametrize("setup", ["query", "feed"])
+@pytest.mark.parametrize("policy", ["scorer", "attention", "paper"])
+def test_resumed_run_equals_an_uninterrupted_one_bit_for_bit(
+    setup: str, policy: str, tmp_path: Path
+) -> None:
+    results = []
+    for stops in ([], [2, 5]):
+        settings = settings_of(setup, policy)
+        path = tmp_path / f"{len(stops)}.pt"
+        for updates in [*stops, 6]:
+            settings["training"]["updates"] = updates
+            trainer, task = trainer_of(settings)
+            if path.exists():
+                checkpoint = Checkpoint.load(path)
+                load_weights(trainer.policy, checkpoint)
+                torch.rand(7)  # whatever else used the global generator
+                trainer.load_state_dict(checkpoint.training)
+            trainer.run(
+                tmp_path / f"run{len(stops)}",
+                lambda s=settings, k=task, t=trainer, p=path: make_checkpoint(s, k, t).save(p),
+            )
+        results.append(Checkpoint.load(path))
+    whole, resumed = results
+    assert same(whole.weights, resumed.weights)
+    for name in ("update", "optimizer", "sessions", "env_generator", "global_generator"):
+        assert same(whole.training[name], resumed.training[name]), name
+    for name, values in whole.progress.history.items():
+        if name.startswith("train/"):
+            assert same(values, resumed.progress.history[name])
+    tables = [(tmp_path / f"run{n}" / "training.csv").read_text() for n in (0, 2)]
+    untimed = [[row.split(",")[:6] for row in table.splitlines()] for table in tables]
+    assert untimed[0] == untimed[1]
+
+
+def test_a2c_learns_what_the_feed_rewards(tmp_path: Path) -> None:
+    """With the paper's ±r reward, asking pays: the episodes get shorter (the paper's Figure 2)."""
+    constants = {"sessions": 32, "steps": 8, "optimizer": "adam", "learning_rate": 0.01}
+    settings = settings_of(policy="paper", updates=60, **constants)
+    settings |= {"objective": "information_gain", "skip": "regret"}
+    trainer, _ = trainer_of(settings)
+    trainer.run(tmp_path, lambda: None)
+    lengths = trainer.progress.history["train/episode_length"]
+    assert sum(lengths[-5:]) / 5 < sum(lengths[1:6]) / 5 - 1
+    assert sum(trainer.progress.history["train/reward"][-5:]) > 0
+
+
+@pytest.mark.parametrize("skip", ["free", "regret"])
+def test_gamma_counts_questions_where_skips_are_free(skip: str) -> None:
+    trainer, _ = trainer_of({**settings_of(gamma=0.5, lmbda=0.0, steps=20), "skip": skip})
+    batch = trainer.sessions.collect()
+    later = batch["next", "state_value"]
+    trainer.update(batch)
+    asked = batch["action"].unsqueeze(-1) == 1
+    assert asked.any()
+    assert not asked.all()
+    discount = torch.where(asked | (skip == "regret"), 0.5, 1.0)
+    target = batch["next", "reward"] + discount * later * ~batch["next", "terminated"]
+    assert torch.allclose(batch["value_target"], target, atol=1e-3)
+
+
+@pytest.mark.parametrize("policy", ["scorer", "attention", "paper"])
+@pytest.mark.parametrize(
+    ("setup", "skip"), [("query", "free"), ("feed", "free"), ("feed", "regret")]
+)
+def test_a_batch_has_the_values_of_each_state_and_the_next(
+    setup: str, skip: str, policy: str
+) -> None:
+    """In mid-session, at its end, and where it was cut off; whatever is remembered of a belief."""
+    trainer, _ = trainer_of({**settings_of(setup, policy, steps=11), "skip": skip})
+    step, states = trainer.env.step_and_maybe_reset, []
+
+    def spy(session: Any) -> Any:
+        session, following = step(session)
+        states.append(session.clone())
+        return session, following
+
+    def skip_often(session: Any) -> Any:
+        return strategy(session).set("action", (torch.rand(4) < 0.3).long())
+
+    strategy = trainer.policy.strategy
+    trainer.sessions.strategy = skip_often
+    trainer.env.step_and_maybe_reset = spy  # type: ignore[method-assign]
+    trainer.sessions.collect()  # sessions are in mid-course then
+    states.clear()
+    batch = trainer.sessions.collect()
+    whole = torch.stack(states, 1)
+    with torch.no_grad():
+        now = trainer.policy.critic(whole.clone())["state_value"]
+        later = trainer.policy.critic(whole["next"].clone())["state_value"]
+    assert torch.allclose(batch["state_value"], now, atol=1e-5)
+    counts = ~whole["next", "terminated"]
+    assert torch.allclose(batch["next", "state_value"][counts], later[counts], atol=1e-5)
+    assert whole["next", "done"].any()
+    assert skip != "regret" or whole["next", "truncated"].any()
+    for key in ("reward", "done", "terminated", "n_asked"):
+        assert torch.equal(batch["next", key], whole["next", key])
+    ended = batch["next", "done"]
+    length = "n_offered" if setup == "feed" else "n_asked"
+    assert torch.equal(batch["next", "step_count"][ended], whole["next", length][ended])
+    assert not {"samples", "human", "history"} & set(batch.keys()) or policy == "attention"
+
+
+def test_critic_steps_bring_the_critic_to_the_returns() -> None:
+    """Without them it still forecasts far too little when the policy begins to learn from it."""
+    errors = []
+    for critic_steps in (0, 20):
+        constants = {"sessions": 32, "steps": None, "optimizer": "adam", "learning_rate": 0.001}
+        settings = settings_of("query", critic_steps=critic_steps, warm_up=20, **constants)
+        trainer, _ = trainer_of(settings)
+        for _ in range(12):
+            trainer.update(trainer.sessions.collect())
+        batch = trainer.sessions.collect()  # whole sessions, from the first question to the last
+        returns = batch["next", "episode_reward"][:, -1]
+        with torch.no_grad():
+            forecast = trainer.policy.value(batch.clone())["state_value"][:, 0]
+        errors.append(float((returns - forecast).mean().abs()))
+    plain, fitted = errors
+    assert fitted < 0.1
+    assert fitted < plain / 2
+
+
+@pytest.mark.parametrize("setup", ["query", "feed"])
+def test_a_batch_has_the_steps_a_session_may_take(setup: str) -> None:
+    trainer, _ = trainer_of(settings_of(setup, steps=None))
+    batch = trainer.sessions.collect()
+    assert batch.shape == (4, 4 if setup == "query" else 20)
+    assert batch["next", "done"].any(1).all()
+
+
+def test_explained_variance_is_the_critics_share_of_the_returns() -> None:
+    target = torch.tensor([0.0, 1.0, 2.0, 3.0])
+    shares = []
+    for value in (target, torch.ones(4), target.mean() + (target - target.mean()) / 2, -9 * target):
+        batch = TensorDict({"value_target": target, "state_value": value}, [4])
+        shares.append(_explained_variance(batch))
+    assert shares == pytest.approx([1, 0, 0.75, -1])
+
+
+def test_warm_up_spares_the_actor_and_the_average_follows() -> None:
+    trainer, _ = trainer_of(settings_of(warm_up=2, average=0.9, learning_rate=0.01))
+    weights = trainer.policy.weights
+
+    def part(name: str) -> torch.Tensor:
+        return torch.cat([p.detach().flatten().clone() for p in weights[name].parameters()])
+
+    def averaged() -> torch.Tensor:
+        names = [name for name, _ in weights.named_parameters()]
+        return torch.cat([trainer.average[name].flatten() for name in names])
+
+    def raw() -> torch.Tensor:
+        return torch.cat([p.detach().flatten().clone() for _, p in weights.named_parameters()])
+
+    actor, expected = part("actor"), raw()
+    for update in range(4):
+        critic = part("critic")
+        trainer.update(trainer.sessions.collect())
+        trainer.progress.update += 1
+        assert torch.equal(part("actor"), actor) == (update < 2)
+        assert not torch.equal(part("critic"), critic)
+        expected = 0.9 * expected + 0.1 * raw()
+        assert torch.allclose(averaged(), expected, atol=1e-6)
+
+
+def test_ctrl_c_stops_after_the_update_and_saves(tmp_path: Path) -> None:
+    trainer, _ = trainer_of(settings_of(updates=1000, save_every=1000))
+    # The tests may run in the background, where Ctrl-C is ignored.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    learn, saved = trainer.update, []
+
+    def interrupt(batch: Any) -> None:
+        if trainer.progress.update == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+        learn(batch)
+
+    trainer.update = interrupt  # type: ignore[method-assign]
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            trainer.run(tmp_path, lambda: saved.append(trainer.progress.update))
+        assert saved == [3]
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("updates", 0),
+        ("sessions", 2.5),
+        ("steps", 0),
+        ("critic_steps", -1),
+        ("learning_rate", -1),
+        ("gamma", 1.5),
+        ("optimizer", "sgd"),
+    ],
+)
+def test_bad_constants_are_refused(key: str, value: object) -> None:
+    with pytest.raises(InputError, match=f"training.{key}="):
+        trainer_of(settings_of(**{key: value}))
+
+
+def test_checkpoint_says_what_does_not_fit(tmp_path: Path) -> None:
+    settings = settings_of("query", "paper")
+    trainer, task = trainer_of(settings)
+    make_checkpoint(settings, task, trainer).save(tmp_path / "checkpoint.pt")
+    checkpoint = Checkpoint.load(tmp_path)
+    checkpoint.check_fits(task.test)
+    with pytest.raises(InputError, match=r"N=31 \(trained on 30\), K=3 \(trained on 2\)"):
+        checkpoint.check_fits(gridworld_pool(31, 3))
+    with pytest.raises(InputError, match=r"D=5 \(trained on 4\)"):
+        checkpoint.check_fits(QueryPool(torch.rand(30, 2, 5)))
+    assert torch.equal(checkpoint.normalizer.std, task.normalizer.std)
+    other = trainer_of(settings_of("feed", "paper"))[0]
+    with pytest.raises(InputError, match="weights do not fit"):
+        load_weights(other.policy, checkpoint)
+
+    scorer, _ = trainer_of(settings_of("query"))
+    make_checkpoint(settings_of("query"), task, scorer).save(tmp_path / "checkpoint.pt")
+    Checkpoint.load(tmp_path).check_fits(gridworld_pool(31), own_indices=True)
+    with pytest.raises(InputError, match="picks indices of a training pool"):
+        checkpoint.check_fits(task.test, own_indices=True)
+
+    gridworld_pool(30, seed=9).save(tmp_path / "train_pool.pt")
+    gridworld_pool(30, seed=9).save(tmp_path / "test_pool.pt")
+    pools = tmp_path / "train_pool.pt", tmp_path / "test_pool.pt"
+    with pytest.raises(InputError, match="does not fit the train pool: digest"):
+        reload_task(checkpoint, *pools)
+
+
+def test_foreign_and_old_checkpoints_are_refused(tmp_path: Path) -> None:
+    gridworld_pool(30).save(tmp_path / "pool.pt")
+    with pytest.raises(InputError, match="holds query pool; expected a torchrl_pref checkpoint"):
+        Checkpoint.load(tmp_path / "pool.pt")
+    torch.save({"kind": "torchrl_pref checkpoint", "format": 0}, tmp_path / "old.pt")
+    with pytest.raises(InputError, match="written by another version"):
+        Checkpoint.load(tmp_path / "old.pt")
+    with pytest.raises(InputError, match="no such file"):
+        Checkpoint.load(tmp_path)
+
+
+def test_rows_after_the_last_checkpoint_are_written_once(tmp_path: Path) -> None:
+    """A run that was killed has logged more than it saved."""
+    settings = settings_of(updates=5, save_every=2)
+    trainer, _ = trainer_of(settings)
+    states: list[dict[str, Any]] = []
+    trainer.run(tmp_path, lambda: states.append(copy.deepcopy(trainer.state_dict())))
+    again, _ = trainer_of(settings)
+    again.load_state_dict(states[0])
+    again.run(tmp_path, lambda: None)
+    rows = (tmp_path / "training.csv").read_text().splitlines()[1:]
+    assert [int(row.split(",")[0]) for row in rows] == [1, 2, 3, 4, 5]

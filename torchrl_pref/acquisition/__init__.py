@@ -1,0 +1,1 @@
+"""What a query is worth: acquisition functions, and their scores of many candidates at once."""

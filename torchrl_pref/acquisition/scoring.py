@@ -1,0 +1,133 @@
+"""Acquisition functions: what a query is expected to teach, from what the belief predicts.
+
+Shapes: B sessions, C candidate queries, M belief samples, K options per query, R possible answers,
+D features, ``…`` any leading dimensions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchrl_pref.acquisition.functions import (
+    Acquisition,
+    alignment_gain,
+    information_gain,
+    volume_removal,
+)
+from torchrl_pref.acquisition.scoring_cpu import compiled_scores
+from torchrl_pref.questions.responses import Prediction, ResponseModel, compiled_constants
+
+CHUNK = 100_000
+"""Returns (B c M K-1) held at once while candidates are scored: bounds memory, fits the cache."""
+
+
+def predict_answers(samples: Tensor, queries: Tensor, response_model: ResponseModel) -> Prediction:
+    """What the belief predicts of the answer to each candidate.
+
+    Args:
+        samples: (B M D), the belief.
+        queries: (B C K D), the candidates.
+        response_model: how the belief thinks the human answers.
+    """
+    leads = queries[..., :-1, :] - queries[..., -1:, :]
+    # M is the innermost axis in memory, as the sums over it are the bulk of the work.
+    returns = (leads.flatten(1, 2) @ samples.mT).unflatten(1, leads.shape[1:3])
+    return response_model.predict(returns.mT)
+
+
+COMPILED: tuple[Acquisition, ...] = (information_gain, alignment_gain, volume_removal)
+"""What ``scoring_cpu.compiled_scores`` knows, in its order."""
+
+
+@dataclass(frozen=True)
+class Together:
+    """Acquisition functions as one of several values (…), so that answers are predicted once."""
+
+    functions: tuple[Acquisition, ...]
+
+    def __call__(self, predicted: Prediction, samples: Tensor) -> Tensor:
+        """Their values (B C V)."""
+        return torch.stack([function(predicted, samples) for function in self.functions], -1)
+
+
+def together(*functions: Acquisition) -> Acquisition:
+    """Acquisition functions as one of several values (…)."""
+    return Together(functions)
+
+
+def score_queries(
+    samples: Tensor,
+    queries: Tensor,
+    response_model: ResponseModel,
+    acquisition: Acquisition,
+) -> Tensor:
+    """Score every candidate: on the CPU compiled, where model and functions are this package's.
+
+    Args:
+        samples: (B M D), the belief.
+        queries: (B C K D), the candidates.
+        response_model: how the belief thinks the human answers.
+        acquisition: what makes the score; it may return several numbers, (B c …).
+
+    Returns:
+        (B C …).
+    """
+    constants = compiled_constants(response_model)
+    functions = acquisition.functions if isinstance(acquisition, Together) else (acquisition,)
+    known = all(each in COMPILED for each in functions)
+    if constants is None or not known or not (_is_plain(samples) and _is_plain(queries)):
+        return score_in_tensors(samples, queries, response_model, acquisition)
+    scores = compiled_scores(samples, queries, *constants)
+    if not isinstance(acquisition, Together):
+        return scores[..., COMPILED.index(acquisition)]
+    if functions == COMPILED:
+        return scores
+    return scores[..., [COMPILED.index(each) for each in functions]]
+
+
+def _is_plain(numbers: Tensor) -> bool:
+    """Whether they are float32 on the CPU, and no gradient is asked of them."""
+    learns = numbers.requires_grad and torch.is_grad_enabled()
+    return numbers.is_cpu and numbers.dtype == torch.float32 and not learns
+
+
+def score_in_tensors(
+    samples: Tensor,
+    queries: Tensor,
+    response_model: ResponseModel,
+    acquisition: Acquisition,
+) -> Tensor:
+    """:func:`score_queries` for any model, function, device and type, and with gradients.
+
+    It goes in chunks, so that memory stays bounded whatever B, C and M are.
+    """
+    sessions, candidates = queries.shape[:2]
+    fits = max(1, CHUNK // (samples.shape[1] * (queries.shape[2] - 1)))
+    step = min(fits, candidates)
+    group = max(1, fits // step)
+    rows = []
+    for start in range(0, sessions, group):
+        belief, shown = samples[start : start + group], queries[start : start + group]
+        parts = [
+            acquisition(
+                predict_answers(belief, shown[:, first : first + step], response_model), belief
+            )
+            for first in range(0, candidates, step)
+        ]
+        rows.append(torch.cat(parts, 1))
+    return torch.cat(rows)
+
+
+def moments_among(scores: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation (B 1 V) of scores (B N V), the latter not below 10⁻⁶."""
+    mean = scores.mean(-2, keepdim=True)
+    return mean, (scores - mean).square().mean(-2, keepdim=True).sqrt().clamp(min=1e-6)
+
+
+def standardise(scores: Tensor) -> Tensor:
+    """Scores (B C V) less their mean over the C of each session, in standard deviations."""
+    mean, deviation = moments_among(scores)
+    return (scores - mean) / deviation

@@ -1,0 +1,371 @@
+"""The belief over the reward weights ω: samples on the unit sphere, batched over sessions.
+
+Shapes: S sessions, M samples, H answers, K options per query, D features.
+
+The prior is uniform on the unit sphere: alignment ignores the scale of ω, and tau carries it.
+After each answer the samples take a step of *resample-move* (Gilks and Berzuini, 2001): reweight by
+the likelihood of the new answer, resample, then move every sample with Markov moves that leave the
+new posterior invariant (see ``sampler.py``). An answer that too few samples agree with is let in by
+stages, and one that hardly any sample foresaw makes the belief begin anew from the prior, see
+:meth:`Belief.update`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Generator, Tensor
+from torch.nn import functional as F
+
+from torchrl_pref.beliefs.resampling import kish_share, resample
+from torchrl_pref.beliefs.slice import Target, round_of_moves
+from torchrl_pref.config.memory import default_moves
+from torchrl_pref.errors import check_count, check_type
+from torchrl_pref.questions.responses import ResponseModel
+from torchrl_pref.tensors import check_finite, check_range
+
+MIN_SHARE = 0.25
+"""Kish effective share of the samples that a reweighting must keep; below it a stage is added."""
+
+MAX_STAGES = 12
+"""Of one answer: twelve stages that keep a quarter each leave less than one in ten million."""
+
+SURPRISE = 0.1
+"""A soft answer makes the belief begin anew where the samples together gave it less than this share
+of the probability that it could have: what none of them is near may then weigh as much."""
+
+RESTART_SHARE, RESTART_STAGES = 0.5, 500
+"""What each stage of a new beginning keeps, and how many stages there may be: it must find every
+mode, and how much each holds."""
+
+FORGOTTEN = 0.95
+"""Moves are repeated until the effective sample size is this share of the samples, at most
+``MAX_ROUNDS`` times."""
+
+MAX_ROUNDS = 5
+
+MOVED = 2**20
+"""Moves of samples that are made at once: bounds memory whatever the number of sessions."""
+
+
+def uniform_sphere(shape: tuple[int, ...], generator: Generator) -> Tensor:
+    """Draw weights uniformly on the unit sphere, (… D), on the generator's device."""
+    normal = torch.randn(shape, generator=generator, device=generator.device)
+    return F.normalize(normal, dim=-1)
+
+
+def feature_gaps(queries: Tensor, answers: Tensor) -> Tensor:
+    """How the features of the chosen option exceed those of the others.
+
+    Args:
+        queries: (… K D), features of the options.
+        answers: (…), index of the chosen option, or -1 where there is no answer yet.
+
+    Returns:
+        (… K-1 D). Zero where there is no answer, which makes that likelihood constant in ω.
+
+    Raises:
+        InputError: an answer is no whole number from -1 to K-1.
+    """
+    n_options = queries.shape[-2]
+    answers = check_range("answers", answers, -1, n_options - 1, "options from 0, -1 where none")
+    shifts = torch.arange(1, n_options, device=queries.device)
+    others = (answers.unsqueeze(-1) + shifts) % n_options
+    chosen = torch.take_along_dim(queries, answers.clamp(min=0)[..., None, None], -2)
+    gaps = chosen - torch.take_along_dim(queries, others.unsqueeze(-1), -2)
+    return gaps * (answers >= 0)[..., None, None]
+
+
+class Update(NamedTuple):
+    """What an answer makes of the belief."""
+
+    samples: Tensor
+    """(S M D), samples of the posterior."""
+    ess: Tensor
+    """(S), effective sample size of the mean, between 1 and M."""
+    used: Tensor
+    """(S) bool, False where the answer contradicts the earlier ones and was left out."""
+
+
+class Belief:
+    """Posterior samples of ω under an assumed response model.
+
+    Args:
+        response_model: how the belief thinks the human answers. It may differ from how they do.
+        samples: M, at least 2. With fewer than 20 each sample has too much of a say in where the
+            others move, and the spread comes out up to 3% too small.
+        moves: Markov moves after each resampling, at least 1; None: as many as there are features
+            (D²/8 beyond 8, D³/128 beyond 16), and at least 4. They are repeated where the samples
+            have not forgotten where they were.
+
+    Raises:
+        InputError: there is no response model, or ``samples`` or ``moves`` is too small.
+    """
+
+    def __init__(
+        self, response_model: ResponseModel, samples: int = 100, moves: int | None = None
+    ) -> None:
+        check_type("response_model", response_model, ResponseModel, "Boltzmann(2.0)")
+        self.response_model = response_model
+        self.n_samples = check_count("belief.samples", samples, 2)
+        self.n_moves = None if moves is None else check_count("belief.moves", moves, 1)
+
+    def prior(self, n_sessions: int, n_features: int, generator: Generator) -> Tensor:
+        """Samples of the prior, (S M D)."""
+        return uniform_sphere((n_sessions, self.n_samples, n_features), generator)
+
+    def update(
+        self, samples: Tensor, ess: Tensor, earlier: Tensor, newest: Tensor, generator: Generator
+    ) -> Update:
+        r"""Condition on one more answer per session.
+
+        Reweighting by an answer that few samples agree with would leave copies of a handful; a hard
+        answer could leave none. The answer is then let in by stages: its return gaps are raised by
+        a slack, the smallest that keeps ``MIN_SHARE`` of the samples effective, and the stages end
+        at a slack of zero, which is the exact posterior.
+
+        An answer that hardly any sample foresaw says that most of the posterior may lie where there
+        are no samples, which no move would mend. The belief then begins anew from the prior and
+        lets in all answers together, by a power of their likelihood that rises to one (Neal,
+        *Annealed importance sampling*, 2001).
+
+        The effective sample size follows the samples through it all. Resampling multiplies the
+        variance of the mean, by the average multiplicity where all samples count alike; moves after
+        which a share of the variance is still explained by the places before leave that share of
+        the excess. M divided by that inflation is the size of an independent sample as good for
+        estimating the mean.
+
+        Args:
+            samples: (S M D), samples of the belief before the answer.
+            ess: (S), their effective sample size.
+            earlier: (S H K-1 D), :func:`feature_gaps` of the earlier answers; zero rows are
+                ignored, H may be 0.
+            newest: (S K-1 D), feature gaps of the answer to condition on.
+            generator: the source of all randomness, on the device of the samples.
+
+        Raises:
+            InputError: a sample or a gap is not finite.
+        """
+        check_finite("samples or feature gaps", samples, earlier, newest)
+        size = max(1, MOVED // (self.n_samples * self._moves_for(samples.shape[-1])))
+        updates = []
+        for first in range(0, max(1, len(samples)), size):
+            some = slice(first, first + size)
+            session = samples[some], ess[some], earlier[some], newest[some]
+            updates.append(self._update(*session, generator))
+        return Update(*(torch.cat(field) for field in zip(*updates, strict=True)))
+
+    def _moves_for(self, n_features: int) -> int:
+        """V."""
+        return default_moves(n_features) if self.n_moves is None else self.n_moves
+
+    def _update(
+        self, samples: Tensor, ess: Tensor, earlier: Tensor, newest: Tensor, generator: Generator
+    ) -> Update:
+        """:meth:`update` for as many sessions as are held in memory at once."""
+        answers = torch.cat([earlier, newest.unsqueeze(1)], 1)
+        foreseen = self.response_model.log_likelihood(_gaps(samples, newest))
+        surprised = foreseen.exp().mean(1) < SURPRISE
+        if surprised.any():
+            indeed = self._surprised(samples[surprised], answers[surprised])
+            surprised = surprised.masked_scatter(surprised, indeed)
+        few = ~surprised & (kish_share(foreseen) < MIN_SHARE)
+        inflation = self.n_samples / ess
+        plain = ~(surprised | few)
+        if plain.all():
+            after = self._let_in(samples, inflation, answers, generator)
+        else:
+            after = samples.clone(), inflation, torch.ones_like(plain)
+            for who, condition in (
+                (plain, self._let_in),
+                (few, self._let_in_by_stages),
+                (surprised, self._begin_anew),
+            ):
+                if who.any():
+                    some = condition(samples[who], inflation[who], answers[who], generator)
+                    for whole, part in zip(after, some, strict=True):
+                        whole[who] = part
+        moved, inflation, used = after
+        return Update(moved, torch.where(used, self.n_samples / inflation, ess), used)
+
+    def _surprised(self, samples: Tensor, answers: Tensor) -> Tensor:
+        """(S), whether samples (S M D) held the last of answers (S H K-1 D) for too unlikely."""
+        model, gaps, newest = self.response_model, _gaps(samples, answers), answers[:, -1]
+        foreseen = model.log_likelihood(gaps[:, :, -1]).exp()
+        # The most that any ω would give it, or nearly: that of the sample or the mean gap.
+        ahead = F.normalize(newest.sum(1), dim=-1).unsqueeze(1)
+        most = model.log_likelihood(_gaps(ahead, newest)).exp()
+        most = torch.cat([foreseen, most], 1).amax(1)
+        # Where an answer can be impossible no power of its likelihood makes it less so.
+        possible = model.joint_log_likelihood(-gaps).isfinite().all(1)
+        return possible & (foreseen.mean(1) < SURPRISE * most)
+
+    def _let_in(
+        self, samples: Tensor, inflation: Tensor, answers: Tensor, generator: Generator
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Let in the last of the answers at once.
+
+        Returns:
+            Samples (S M D), inflation (S), and that the answer was used (S).
+        """
+        model = self.response_model
+        log_weights = model.log_likelihood(_gaps(samples, answers[:, -1]))
+        target = Target(answers, torch.zeros_like(inflation), torch.ones_like(inflation), model)
+        after = self._resample_move(samples, inflation, log_weights, target, generator)
+        return *after, torch.ones_like(inflation, dtype=torch.bool)
+
+    def _let_in_by_stages(
+        self, samples: Tensor, inflation: Tensor, answers: Tensor, generator: Generator
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Let in the last of the answers, by a slack that falls to zero.
+
+        Returns:
+            Samples (S M D), inflation (S), and whether the answer was used (S): one that no sample
+            agrees with in the end contradicts the earlier ones.
+        """
+        model, before = self.response_model, (samples, inflation)
+        samples, inflation = samples.clone(), inflation.clone()
+        slack = torch.full_like(inflation, math.inf)
+        todo = torch.arange(len(samples), device=samples.device)
+        for stage in range(MAX_STAGES):
+            if todo.numel() == 0:
+                break
+            gaps = _gaps(samples[todo], answers[todo, -1])
+            log_now = self._log_raised(gaps, slack[todo])
+            next_slack = self._next_slack(gaps, slack[todo], log_now)
+            if stage == MAX_STAGES - 1:
+                # Better a few copies than no answer: only an impossible one is left out.
+                possible = self._log_raised(gaps, torch.zeros_like(next_slack)) > -math.inf
+                next_slack = torch.where(possible.any(1), 0.0, next_slack)
+            slack[todo] = next_slack
+            log_weights = self._log_weights(gaps, next_slack, log_now)
+            target = Target(answers[todo], next_slack, torch.ones_like(next_slack), model)
+            given = samples[todo], inflation[todo], log_weights, target, generator
+            samples[todo], inflation[todo] = self._resample_move(*given)
+            todo = todo[next_slack > 0]
+        # In float64, where one gap and its negative differ by nothing that counts.
+        gaps = _gaps(samples.double(), answers.double())
+        agrees = model.agrees(gaps[:, :, -1]) & (model.joint_log_likelihood(gaps) > -math.inf)
+        used = (slack == 0) & agrees.any(1)
+        samples = torch.where(used[:, None, None], samples, before[0])
+        return samples, torch.where(used, inflation, before[1]), used
+
+    def _begin_anew(
+        self, samples: Tensor, inflation: Tensor, answers: Tensor, generator: Generator
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Let in all answers from the prior, by a power of their likelihood that rises to one.
+
+        What the samples were before does not matter.
+
+        Returns:
+            Samples (S M D), inflation (S), and that the answer was used (S).
+        """
+        model = self.response_model
+        samples = self.prior(len(samples), samples.shape[2], generator).to(samples)
+        inflation, power = torch.ones_like(inflation), torch.zeros_like(inflation)
+        todo = torch.arange(len(samples), device=samples.device)
+        for stage in range(RESTART_STAGES):
+            if todo.numel() == 0:
+                break
+            likelihood = model.joint_log_likelihood(_gaps(samples[todo], answers[todo]))
+            now = power[todo]
+            next_power = self._next_power(likelihood, now)
+            if stage == RESTART_STAGES - 1:
+                next_power = torch.ones_like(now)
+            power[todo] = next_power
+            log_weights = (next_power - now).unsqueeze(1) * likelihood
+            target = Target(answers[todo], torch.zeros_like(now), next_power, model)
+            given = samples[todo], inflation[todo], log_weights, target, generator
+            samples[todo], inflation[todo] = self._resample_move(*given)
+            todo = todo[next_power < 1]
+        return samples, inflation, torch.ones_like(power, dtype=torch.bool)
+
+    def _next_power(self, likelihood: Tensor, power: Tensor) -> Tensor:
+        """(S), the largest power of the likelihood (S M) that keeps enough samples effective."""
+        # By this much no weight becomes more than twice another.
+        spread = (likelihood.amax(1) - likelihood.amin(1)).clamp(min=1e-20)
+        return _furthest(
+            (power + math.log(2) / spread).clamp(max=1),
+            torch.ones_like(power),
+            lambda to: kish_share((to - power).unsqueeze(-1) * likelihood) >= RESTART_SHARE,
+        )
+
+    def _log_raised(self, gaps: Tensor, slack: Tensor) -> Tensor:
+        """(… S M), of one answer with gaps (S M K-1) raised by slack (… S); infinite slack gives
+        0."""
+        raised = gaps + slack.nan_to_num(posinf=0.0)[..., None, None]
+        log_likelihood = self.response_model.log_likelihood(raised)
+        return log_likelihood.masked_fill(slack.isinf()[..., None], 0.0)
+
+    def _log_weights(self, gaps: Tensor, slack: Tensor, log_now: Tensor) -> Tensor:
+        """(… S M), of samples with log-likelihoods (S M) when an answer's slack becomes this
+        (… S)."""
+        # By rounding a sample may lie just outside of where it was moved to, and is dropped.
+        return self._log_raised(gaps, slack) - log_now.clamp(min=torch.finfo(log_now.dtype).min)
+
+    def _next_slack(self, gaps: Tensor, slack: Tensor, log_now: Tensor) -> Tensor:
+        """(S), the smallest slack that keeps enough of the samples effective."""
+        result = torch.zeros_like(slack)
+        few = kish_share(self._log_weights(gaps, result, log_now)) < MIN_SHARE
+        if few.any():
+            gaps, log_now = gaps[few], log_now[few]
+            # At this slack every sample agrees, so the weights differ by a factor of at most K.
+            start = torch.minimum(slack[few], (-gaps).amax((1, 2)).clamp(min=0))
+            result[few] = _furthest(
+                start,
+                torch.zeros_like(start),
+                lambda to: kish_share(self._log_weights(gaps, to, log_now)) >= MIN_SHARE,
+            )
+        return result
+
+    def _resample_move(
+        self,
+        samples: Tensor,
+        inflation: Tensor,
+        log_weights: Tensor,
+        target: Target,
+        generator: Generator,
+    ) -> tuple[Tensor, Tensor]:
+        """New samples (S M D) and the inflation (S) of the variance of their mean."""
+        start, factor = resample(samples, log_weights, generator)
+        excess = inflation * factor - 1
+        n_moves = self._moves_for(samples.shape[2])
+        moved, explained = round_of_moves(start, start, n_moves, target, generator)
+        inflation = 1 + explained * excess
+        for _ in range(MAX_ROUNDS - 1):
+            who = (inflation > 1 / FORGOTTEN).nonzero().squeeze(-1)
+            if who.numel() == 0:
+                break
+            again = start[who], moved[who], n_moves, target.of(who)
+            moved[who], explained = round_of_moves(*again, generator)
+            inflation[who] = 1 + explained * excess[who]
+        return moved, inflation.clamp(1, samples.shape[1])
+
+
+def _gaps(samples: Tensor, feature_gaps: Tensor) -> Tensor:
+    """Return gaps (S M … K-1) under samples (S M D), from feature gaps (S … K-1 D)."""
+    rows = feature_gaps.flatten(1, -2)
+    return (samples @ rows.mT).unflatten(-1, feature_gaps.shape[1:-1])
+
+
+def _furthest(start: Tensor, end: Tensor, fits: Callable[[Tensor], Tensor]) -> Tensor:
+    """(S), the end where it fits, else as near to it as fits, from a start (S) that does.
+
+    ``fits`` takes places (P S) and says for each whether it fits. Thirty times an interval is
+    halved; for a few sessions it is faster to cut it into 32 parts, six times.
+    """
+    reached = fits(end[None])[0]
+    if reached.all():
+        return end
+    parts, times = (32, 6) if len(start) <= 32 else (2, 30)
+    share = torch.linspace(0, 1, parts + 1, device=start.device)[:, None]
+    near, beyond = start, end
+    for _ in range(times):
+        places = torch.lerp(near, beyond, share)
+        # The first place fits, and the last does not.
+        n_fit = fits(places[1:-1]).cumprod(0).sum(0, keepdim=True)
+        near, beyond = places.gather(0, n_fit)[0], places.gather(0, n_fit + 1)[0]
+    return torch.where(reached, end, near)

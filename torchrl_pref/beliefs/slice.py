@@ -1,0 +1,154 @@
+"""The Markov moves of the belief: slice sampling on the unit sphere along great circles.
+
+Shapes: S sessions, M samples, H answers, K options per query, D features, V moves, P sets of
+samples that share a pole, U uniforms of a move.
+
+A slice sampler (Neal, 2003) restricted to a great circle through the current point (Habeck,
+Hasenpflug, Kodgirwar and Rudolf, *Geodesic slice sampling on the sphere*, 2023). It has no step
+size that must be right, and works for hard answers, whose likelihood is zero on one side.
+
+The move is here twice: in tensors, for any response model on any device, and in ``sampler_cpu.py``
+as a compiled loop, for the models of this package on the CPU. Given the same uniforms both move a
+sample to the same place, but for rounding at the very edge of a slice.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Generator, Tensor
+from torch.nn import functional as F
+
+from torchrl_pref.beliefs.resampling import FRAMES, explained_share, group_of, poles_of
+from torchrl_pref.beliefs.slice_cpu import compiled_moves
+from torchrl_pref.questions.responses import ResponseModel, compiled_constants
+
+ARC = 32.0
+"""Length of the arc that is searched, in standard deviations of the posterior along it. A short
+one slows the mixing, a long one costs a shrink for each doubling."""
+
+MAX_SHRINKS = 16
+"""Shrinks of an arc before a sample stays where it is. The same shrinks lead back from where it
+would have gone, so that giving up leaves the posterior invariant too."""
+
+
+class Target(NamedTuple):
+    """A density on the sphere: a power of the likelihood of all answers, the last one eased."""
+
+    answers: Tensor
+    """(S H K-1 D), feature gaps of at least one answer; zero rows are ignored."""
+    slack: Tensor
+    """(S), by how much the return gaps of the last answer are raised."""
+    power: Tensor
+    """(S), to which the likelihood is raised."""
+    response_model: ResponseModel
+    """The likelihood."""
+
+    def of(self, sessions: Tensor) -> Target:
+        """The same for some of the sessions."""
+        some = self.answers[sessions], self.slack[sessions], self.power[sessions]
+        return Target(*some, self.response_model)
+
+
+def round_of_moves(
+    start: Tensor,
+    samples: Tensor,
+    n_moves: int,
+    target: Target,
+    generator: Generator,
+) -> tuple[Tensor, Tensor]:
+    """Move every sample V times, each time along the great circle through it and a pole.
+
+    The posterior is left invariant if a pole does not depend on the samples that move towards it:
+    it is drawn from the spread of the other groups. On a circle the uniform measure of the sphere
+    has density |sin ∠(ω, pole)|^(D-2): the meridians of a sphere crowd at its poles.
+
+    Args:
+        start: (S M D), where the samples were before any moves.
+        samples: (S M D), where they are.
+        n_moves: V.
+        target: what the moves leave invariant.
+        generator: the source of randomness, on the device of the samples.
+
+    Returns:
+        Samples (S M D), and how much of their variance ``start`` explains (S).
+    """
+    n_sessions, n_samples, n_features = samples.shape
+    device = samples.device
+    shape = (n_sessions, FRAMES, n_moves, n_features)
+    normal = torch.randn(shape, generator=generator, device=device)
+    size = (n_moves, n_sessions, n_samples, 2 + MAX_SHRINKS)
+    uniform = torch.rand(size, generator=generator, device=device)
+    poles = poles_of(samples, normal)
+    constants = compiled_constants(target.response_model)
+    if samples.is_cpu and constants is not None:
+        answers, slack, power, _ = target
+        moved = compiled_moves(samples, poles, uniform, answers, slack, power, ARC, *constants)
+    else:
+        moved = tensor_moves(samples, poles, uniform, target)
+    return moved, explained_share(start, moved)
+
+
+def tensor_moves(samples: Tensor, poles: Tensor, uniform: Tensor, target: Target) -> Tensor:
+    """:func:`round_of_moves` in tensors, with poles (V S P D) and uniforms (V S M U) given.
+
+    Returns:
+        (S M D), unit vectors.
+    """
+    group = group_of(samples.shape[1], poles.shape[2], samples.device)
+    for ahead, luck in zip(poles, uniform, strict=True):
+        samples = _tensor_move(samples, ahead[:, group], luck, target)
+    return samples
+
+
+def _tensor_move(samples: Tensor, poles: Tensor, uniform: Tensor, target: Target) -> Tensor:
+    """One move of samples (S M D) towards a pole each (S M D), with uniforms (S M U).
+
+    Every sample goes through all shrinks, also when it has found its place, so that nothing has
+    to be counted and no device is waited for.
+    """
+    meridians = samples.shape[-1] - 2
+    along = (poles * samples).sum(-1, keepdim=True)
+    across = poles - along * samples
+    height = across.norm(dim=-1, keepdim=True).clamp(min=1e-20)
+    tangents = across / height
+    pole_angle = torch.atan2(height, along).squeeze(-1)
+    # Samples are innermost in memory: every operation below then runs along them.
+    size = (*target.answers.shape[:3], samples.shape[1])
+    rows = target.answers.flatten(1, 2)
+    cosine = (rows @ samples.mT).view(size).permute(1, 2, 0, 3).contiguous()
+    sine = (rows @ tangents.mT).view(size).permute(1, 2, 0, 3).contiguous()
+
+    def log_density(angle: Tensor) -> Tensor:
+        """(S M), of the points at an angle (S M) on their circles."""
+        gaps = torch.addcmul(cosine * angle.cos(), sine, angle.sin())
+        gaps[-1] += target.slack.unsqueeze(-1)
+        likelihood = target.response_model.joint_log_likelihood(gaps.permute(2, 3, 0, 1))
+        meridian = (pole_angle - angle).sin().abs().clamp(min=1e-30).log()
+        return target.power.unsqueeze(-1) * likelihood + meridians * meridian
+
+    place, level, *fractions = uniform.unbind(-1)
+    angle = torch.zeros_like(pole_angle)
+    threshold = log_density(angle) + torch.log1p(-level)
+    threshold = threshold.clamp(min=torch.finfo(threshold.dtype).min)  # the impossible stays below
+    # Of two features there is but one circle, and going round it reaches every mode.
+    arc = (ARC * poles.norm(dim=-1)).clamp(min=0 if meridians else 2 * math.pi, max=2 * math.pi)
+    high = place * arc
+    # Where the answers are possible is the same seen from each place there.
+    raised = torch.zeros_like(cosine)
+    raised[-1] += target.slack.unsqueeze(-1)
+    circles = cosine.flatten(0, 1), sine.flatten(0, 1), raised.flatten(0, 1)
+    first, last = target.response_model.possible_arc(*circles)
+    low, high = torch.maximum(high - arc, first), torch.minimum(high, last)
+    found = torch.zeros_like(angle, dtype=torch.bool)
+    for fraction in fractions:
+        proposal = torch.lerp(low, high, fraction)
+        accepted = log_density(proposal) >= threshold
+        angle = torch.where(accepted & ~found, proposal, angle)
+        found |= accepted
+        ahead = proposal > 0
+        low, high = torch.where(ahead, low, proposal), torch.where(ahead, proposal, high)
+    angle = angle.unsqueeze(-1)
+    return F.normalize(samples * angle.cos() + tangents * angle.sin(), dim=-1)

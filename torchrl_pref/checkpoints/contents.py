@@ -1,0 +1,194 @@
+"""What must be in a checkpoint, so that whoever reads it later finds what they look for.
+
+Structure only: that each section is there, with its keys, and holds plain values of the right type.
+Whether a number makes sense is checked where it is used.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchrl_pref.errors import InputError
+from torchrl_pref.storage.files import is_dense
+
+WHOLE, NUMBER, TEXT, FLAG = (int,), (int, float), (str,), (bool,)
+NONE = (type(None),)
+
+Types = tuple[type, ...]
+
+TOP: dict[str, Types] = {
+    "tau": NUMBER + TEXT,
+    "tau_spread": NUMBER,
+    "objective": TEXT,
+    "skip": TEXT,
+    "device": TEXT,
+    "threads": WHOLE,
+    "seed": WHOLE,
+}
+
+SECTIONS: dict[str, dict[str, Types]] = {
+    "grid": {"size": WHOLE, "length": WHOLE},
+    "pool": {
+        **dict.fromkeys(("size", "options", "seed"), WHOLE),
+        **dict.fromkeys(("train", "test"), TEXT + NONE),
+    },
+    "belief": {"samples": WHOLE, "moves": WHOLE + NONE},
+    "evaluation": {"humans": WHOLE, "seed": WHOLE},
+    "training": {
+        **dict.fromkeys(("updates", "sessions", "critic_steps", "warm_up", "save_every"), WHOLE),
+        **dict.fromkeys(("learning_rate", "gamma", "lmbda", "entropy", "critic"), NUMBER),
+        **dict.fromkeys(("grad_norm", "average"), NUMBER),
+        "steps": WHOLE + NONE,
+        "optimizer": TEXT,
+    },
+}
+
+SETUPS: dict[str, dict[str, Types]] = {
+    "query": {"budget": WHOLE, "candidates": WHOLE + NONE, "repeats": FLAG},
+    "feed": {"budget": WHOLE, "offers": WHOLE + NONE, "on_skip": TEXT},
+}
+
+POLICIES: dict[str, dict[str, Types]] = {
+    "scorer": {"sample": FLAG, "start": TEXT + NONE},
+    "attention": {"sample": FLAG, "tokens": TEXT},
+    "paper": {"sample": FLAG},
+}
+
+CURVES = ("train/alignment", "train/episode_length", "train/reward")
+"""What figures are made of; a history may have more."""
+
+TRAINING = ("update", "weights", "optimizer", "sessions", "env_generator", "global_generator")
+"""What training goes on from; a policy that is only used has none of it."""
+
+
+def check_content(content: dict[str, Any]) -> None:
+    """Refuse a checkpoint in which something is missing or of another type.
+
+    Args:
+        content: the fields of a ``Checkpoint``.
+
+    Raises:
+        InputError: says what came and what was expected; the caller adds the file.
+    """
+    _check_settings(content["settings"])
+    shape = content["pool_shape"]
+    _check_types("pool_shape", shape, dict.fromkeys("NKD", WHOLE))
+    _expect(shape["N"] >= 1 and shape["K"] >= 2 and shape["D"] >= 2, "pool_shape", "real sizes")
+    tau = content["tau"]
+    fits = type(tau) in NUMBER and math.isfinite(tau) and tau > 0
+    _expect(tau is None or fits, "tau", "None or a finite number above 0")
+    for name in ("mean", "std"):
+        value = content[name]
+        fits = _is_weight(value) and tuple(value.shape) == (shape["D"],)
+        _expect(fits, name, f"{shape['D']} finite numbers")
+    _expect(bool((content["std"] > 0).all()), "std", "numbers above 0")
+    for name in ("train_digest", "test_digest"):
+        value = content[name]
+        fits = type(value) is str and re.fullmatch("[0-9a-f]{64}", value) is not None
+        _expect(fits, name, "a SHA-256 in hexadecimal")
+    check_weights("weights", content["weights"])
+    _check_training(content["training"])
+
+
+def check_weights(name: str, weights: Any) -> None:
+    """Refuse what is not a dict of names to finite float32 tensors.
+
+    Raises:
+        InputError: it is not.
+    """
+    _expect(isinstance(weights, dict), name, "a dict of tensors")
+    for key, value in weights.items():
+        fits = type(key) is str and _is_weight(value)
+        _expect(
+            fits,
+            name,
+            f"float32 tensors without NaN or infinity, and {key!r:.60} is none (a training that "
+            "diverged leaves NaN: lower training.learning_rate)",
+        )
+
+
+def _check_settings(settings: Any) -> None:
+    _expect(isinstance(settings, dict), "settings", "a dict")
+    named = {"setup": SETUPS, "policy": POLICIES}
+    for section, known in named.items():
+        value = settings.get(section)
+        name = value.get("name") if isinstance(value, dict) else None
+        name = name if type(name) is str else ""
+        _expect(name in known, f"settings.{section}.name", f"one of {', '.join(known)}")
+        _check_types(f"settings.{section}", value, known[name])
+    for section, keys in SECTIONS.items():
+        _check_types(f"settings.{section}", settings.get(section), keys)
+    _check_types("settings", settings, TOP, (*SECTIONS, *named, "overrides"))
+    overrides = settings.get("overrides")
+    fits = type(overrides) is list and all(type(typed) is str for typed in overrides)
+    _expect(fits, "settings.overrides", "a list of texts")
+
+
+def _check_types(
+    name: str, section: Any, keys: dict[str, Types], others: tuple[str, ...] = ()
+) -> None:
+    """A section has these keys with values of these types; what else it has is plain."""
+    _expect(isinstance(section, dict), name, "a section of keys")
+    for key, types in keys.items():
+        words = " or ".join("null" if kind is NONE[0] else kind.__name__ for kind in types)
+        _expect(type(section.get(key, ...)) in types, f"{name}.{key}", words)
+    for key, value in section.items():
+        plain = type(value) in NUMBER + TEXT + FLAG + NONE or key in others
+        _expect(type(key) is str and plain, f"{name}.{key!s:.60}", "a plain value")
+
+
+def _check_training(training: Any) -> None:
+    _expect(isinstance(training, dict), "training", "a dict")
+    history = training.get("history")
+    fits = isinstance(history, dict) and all(name in history for name in CURVES)
+    _expect(fits, "training.history", f"a dict of lists, {', '.join(CURVES)} among them")
+    for name, values in history.items():
+        fits = type(name) is str and re.fullmatch("[a-z]+/[a-z_]+", name) is not None
+        fits = fits and type(values) is list
+        fits = fits and all(type(value) in NUMBER for value in values)
+        _expect(fits, "training.history", "lists of numbers")
+    lengths = {len(values) for values in history.values()}
+    _expect(len(lengths) <= 1, "training.history", "lists of one length")
+    _check_held_out(training.get("held_out", {}), training.get("baseline"))
+    if set(training) <= {"history", "update", "held_out", "baseline"}:
+        return
+    for name in TRAINING:
+        _expect(name in training, f"training.{name}", "the state of the training")
+    update = training["update"]
+    _expect(type(update) is int and lengths == {update}, "training.update", "the history's length")
+    check_weights("training.weights", training["weights"])
+    optimizer = training["optimizer"]
+    fits = isinstance(optimizer, dict) and isinstance(optimizer.get("state"), dict)
+    _expect(fits, "training.optimizer", "the state of an optimizer")
+    _expect(isinstance(training["sessions"], dict), "training.sessions", "a dict of tensors")
+    for name in ("env_generator", "global_generator"):
+        value = training[name]
+        fits = is_dense(value) and value.dtype == torch.uint8 and value.ndim == 1
+        _expect(fits, f"training.{name}", "a tensor of bytes")
+
+
+def _check_held_out(held_out: Any, baseline: Any) -> None:
+    """What is known of held-out humans: one number for each, by update and of a baseline."""
+    fits = isinstance(held_out, dict) and all(
+        type(update) is int and update >= 0 and _is_weight(values) and values.ndim == 1
+        for update, values in held_out.items()
+    )
+    _expect(fits, "training.held_out", "by update, a number for each held-out human")
+    fits = type(baseline) is tuple and len(baseline) == 2 and type(baseline[0]) is str
+    fits = fits and _is_weight(baseline[1]) and baseline[1].ndim == 1
+    _expect(baseline is None or fits, "training.baseline", "a name, and a number for each human")
+
+
+def _is_weight(value: Any) -> bool:
+    fits = is_dense(value) and isinstance(value, Tensor) and value.dtype == torch.float32
+    return fits and bool(value.isfinite().all())
+
+
+def _expect(fits: bool, name: str, expected: str) -> None:
+    if not fits:
+        raise InputError(f"{name} is missing or spoiled: expected {expected}")

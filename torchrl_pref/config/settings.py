@@ -1,0 +1,242 @@
+"""The settings of a run, checked as a whole before anything is made of them.
+
+A table says for each key what its values may be; a section's keys are written with dots, as they
+are typed. What can be told from settings alone is told here, in one line and before the heavy
+imports: nothing has been made, written or trained by then. What a pool or a checkpoint holds is
+looked at by what reads it, and the library's constructors check their own arguments again.
+
+Settings are nested dicts of plain values, as composed by Hydra or read from a checkpoint.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from torchrl_pref.config.checks import (
+    LARGEST_THREADS,
+    Check,
+    check_device,
+    check_path,
+    check_spread,
+    check_tau,
+    choice,
+    count,
+    one_or_more,
+    optional,
+    positive,
+)
+from torchrl_pref.config.memory import check_memory
+from torchrl_pref.errors import (
+    InputError,
+    check_choice,
+    check_count,
+    check_flag,
+    check_seed,
+    check_share,
+)
+
+Settings = dict[str, Any]
+
+OBJECTIVES = ("information_gain", "alignment", "true_alignment", "entropy")
+
+TASK: dict[str, Check] = {
+    "tau_spread": check_spread,
+    "objective": choice(*OBJECTIVES),
+    "skip": choice("regret", "free"),
+    "device": check_device,
+    "threads": count(1, LARGEST_THREADS),
+    "grid.size": count(2, 2**24),  # float32 counts cells no further
+    "grid.length": count(1),
+    "pool.size": count(1),
+    "pool.options": count(2),
+    "pool.seed": count(0, 2**29 - 1),  # a pool takes two seeds below 2**31, and there are two
+    "pool.train": optional(check_path),
+    "pool.test": optional(check_path),
+    "belief.samples": count(2),
+    "belief.moves": optional(count(1)),
+    "evaluation.humans": count(2),
+    "evaluation.seed": check_seed,
+}
+"""Of both scripts."""
+
+TRAINING: dict[str, Check] = {
+    "tau": check_tau,
+    "seed": check_seed,
+    "evaluation.during": count(0),
+    "training.updates": count(1),
+    "training.sessions": count(1),
+    "training.steps": optional(count(1)),
+    "training.optimizer": choice("adam", "rmsprop"),
+    "training.learning_rate": positive(1.0),
+    "training.gamma": check_share,
+    "training.lmbda": check_share,
+    "training.entropy": check_share,
+    "training.critic": positive(1e6),
+    "training.critic_steps": count(0),
+    "training.grad_norm": positive(1e6),
+    "training.warm_up": count(0),
+    "training.average": check_share,
+    "training.save_every": count(1),
+}
+"""Of a training."""
+
+TRAIN_DOOR: dict[str, Check] = {"resume": optional(check_path), "checkpoint": optional(check_path)}
+"""Of train.py, and not of the run that it starts."""
+
+EVALUATE: dict[str, Check] = {
+    "tau": one_or_more(check_tau),
+    "protocol": optional(choice("heldout")),
+    "workers": count(1, LARGEST_THREADS),
+    "checkpoint": optional(one_or_more(check_path)),
+}
+"""Of evaluate.py."""
+
+SETUPS: dict[str, dict[str, Check]] = {
+    "query": {
+        "setup.budget": count(1),
+        "setup.candidates": optional(count(1)),
+        "setup.repeats": check_flag,
+    },
+    "feed": {
+        "setup.budget": count(1),
+        "setup.offers": optional(count(1)),
+        "setup.on_skip": choice("new", "repeat"),
+    },
+}
+POLICIES: dict[str, dict[str, Check]] = {
+    "scorer": {"policy.start": optional(choice(*OBJECTIVES)), "policy.sample": check_flag},
+    "attention": {
+        "policy.tokens": choice("samples", "covariance", "mean"),
+        "policy.sample": check_flag,
+    },
+    "paper": {"policy.sample": check_flag},
+}
+PRETRAINED: dict[str, dict[str, Check]] = {"pretrained": {}}
+"""The policies that evaluate.py can be asked for by name."""
+
+SECTIONS = ("grid", "pool", "belief", "evaluation", "training", "setup", "policy")
+
+
+def check_train_settings(settings: Settings) -> None:
+    """Refuse what train.py cannot start or go on with.
+
+    Raises:
+        InputError: a key is missing, unknown or out of its range, or two do not go together.
+    """
+    _check_keys(settings, TASK | TRAINING | TRAIN_DOOR, POLICIES)
+    check_run(settings)
+
+
+def check_run(settings: Settings) -> None:
+    """Refuse the settings of a training, of train.py's or of a checkpoint's.
+
+    Raises:
+        InputError: a key is missing, unknown or out of its range, or two do not go together.
+    """
+    own = {key: value for key, value in settings.items() if key not in (*TRAIN_DOOR, "overrides")}
+    _check_keys(own, TASK | TRAINING, POLICIES)
+    _check_together(own)
+    setup, policy = own["setup"], own["policy"]
+    if setup["name"] == "feed" and policy.get("start") is not None:
+        raise InputError(
+            f"policy.start={policy['start']}: in the feed the scorer starts from the quantile "
+            "rule; leave policy.start out, or set setup=query"
+        )
+    check_memory(own)
+
+
+def check_evaluate_settings(settings: Settings) -> None:
+    """Refuse what evaluate.py cannot do.
+
+    Raises:
+        InputError: a key is missing, unknown or out of its range, or two do not go together.
+    """
+    _check_keys(settings, TASK | EVALUATE, PRETRAINED if "policy" in settings else {})
+    _check_together(settings)
+    if "policy" in settings:
+        one_or_more(choice("noisy", "optimal"))("tau", settings["tau"])
+    check_memory(settings)
+
+
+def _check_keys(
+    settings: Settings, table: Mapping[str, Check], policies: Mapping[str, Mapping[str, Check]]
+) -> None:
+    """Hold every key to its check, and the keys to the table and to the chosen groups' own."""
+    for section in SECTIONS:
+        if not isinstance(settings.get(section, {}), dict):
+            raise InputError(
+                f"{section}={settings[section]!r}: {section} is a section of keys and not a value; "
+                f"type {section}.<key>=<value>, --help lists them"
+            )
+    checks = dict(table)
+    for group, tables in (("setup", SETUPS), ("policy", policies)):
+        if tables:
+            checks |= _group_checks(settings, group, tables)
+    given = _flat(settings)
+    for key in given:
+        if key not in checks:
+            raise InputError(
+                f"{key}={given[key]!r}: there is no such key here, with {_chosen(settings)}; "
+                f"remove {key}, or the experiment that sets it; --help lists the keys"
+            )
+    for key, check in checks.items():
+        if key not in given:
+            raise InputError(f"{key} is missing: expected a value; leave out what removes {key}")
+        check(key, given[key])
+
+
+def _group_checks(
+    settings: Settings, group: str, tables: Mapping[str, Mapping[str, Check]]
+) -> dict[str, Check]:
+    """The checks of the setup or of the policy that is chosen."""
+    options = " or ".join(f"{group}={name}" for name in tables)
+    if "name" not in settings.get(group, {}):
+        raise InputError(f"{group} is missing: expected one; type {options}")
+    name = settings[group]["name"]
+    check_choice(group, name, tuple(tables))
+    return {f"{group}.name": choice(name), **tables[name]}
+
+
+def _flat(settings: Settings) -> dict[str, Any]:
+    """The values by dotted key; what is no section of ours counts as a value."""
+    flat: dict[str, Any] = {}
+    for key, value in settings.items():
+        if key in SECTIONS:
+            flat |= {f"{key}.{inner}": each for inner, each in value.items()}
+        else:
+            flat[key] = value
+    return flat
+
+
+def _chosen(settings: Settings) -> str:
+    """The groups that decide which keys there are."""
+    groups = {group: settings.get(group, {}).get("name") for group in ("setup", "policy")}
+    return " and ".join(f"{group}={name}" for group, name in groups.items() if name is not None)
+
+
+def _check_together(settings: Settings) -> None:
+    """Refuse values that are right one by one and wrong together."""
+    pool, setup, belief = settings["pool"], settings["setup"], settings["belief"]
+    given = [name for name in ("train", "test") if pool[name] is not None]
+    if len(given) == 1 and settings.get("checkpoint") is None:
+        raise InputError(
+            f"pool.{given[0]}={pool[given[0]]} alone: the other pool would be the Gridworld's; "
+            "expected both pool.train and pool.test of your own, or neither"
+        )
+    budget = setup["budget"]
+    if setup["name"] == "feed":
+        if setup["offers"] is not None:
+            check_count("setup.offers", setup["offers"], budget)
+    elif not setup["repeats"] and pool["train"] is None:
+        shown = min(pool["size"], setup["candidates"] or pool["size"])
+        if shown < budget:
+            raise InputError(
+                f"setup.repeats=false with {shown} candidates and setup.budget={budget}: expected "
+                "at least as many candidates as asks; raise one or lower the other"
+            )
+    if settings["objective"] == "entropy" and belief["samples"] < 4:
+        raise InputError(
+            f"objective=entropy with belief.samples={belief['samples']}: expected at least 4, as "
+            "the entropy is told by the third nearest sample; raise belief.samples"
+        )

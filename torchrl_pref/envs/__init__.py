@@ -1,0 +1,1 @@
+"""Sessions as TorchRL environments, and what a policy is rewarded for."""

@@ -1,0 +1,124 @@
+"""The paper's second question as an environment: queries stream by, ask or skip.
+
+Shapes: as in ``envs.session``.
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from torchrl_pref.beliefs.sampled import Belief
+from torchrl_pref.envs.session import SessionEnv, State
+from torchrl_pref.errors import check_choice, check_count
+from torchrl_pref.humans.simulated import SimulatedHuman
+from torchrl_pref.pool import QueryPool
+
+
+class FeedEnv(SessionEnv):
+    r"""The paper's second formulation: queries stream by, ask or skip (section 3.4).
+
+    State: the belief and the offered query. Action: 1 asks, 0 skips. The episode ends at H asked
+    queries or O offered ones. Reward, by ``skip``: with ``regret``, the paper's, asking is worth
+    what the offer is expected to add to the objective, r, and skipping costs it: -r; running out of
+    offers truncates. With ``free``, asking is worth what the answer does add and skipping is worth
+    nothing: what is scarce is the H asks, and running out of offers is an end as any other.
+
+    Args:
+        pool: the queries, normalised. Offers are drawn from it independently and uniformly.
+        human: who answers.
+        belief: how answers become a belief.
+        budget: H, queries asked in an episode, at least 1.
+        offers: O, at least H. None is the paper's 2H with ``regret`` and 5H with ``free``.
+        on_skip: ``new`` offers another query after a skip; ``repeat`` is the paper's literal
+            s' = s and offers the same one again.
+        skip: ``regret`` or ``free``.
+        objective: a name of ``objectives.OBJECTIVES``; the default is the paper's.
+        batch_size: (B,), sessions that run side by side.
+        seed: seeds the environment's own generator; the global generators are never used.
+        device: where the tensors live.
+
+    Raises:
+        InputError: a number is below its minimum, or ``on_skip`` or ``skip`` is another word.
+    """
+
+    _state_keys = (
+        "human",
+        "samples",
+        "mean",
+        "history",
+        "n_asked",
+        "metrics",
+        "offers",
+        "n_offered",
+    )
+
+    def __init__(
+        self,
+        pool: QueryPool,
+        human: SimulatedHuman,
+        belief: Belief,
+        budget: int = 20,
+        offers: int | None = None,
+        on_skip: str = "new",
+        skip: str = "regret",
+        objective: str = "information_gain",
+        batch_size: tuple[int, ...] = (64,),
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        super().__init__(pool, human, belief, budget, objective, batch_size, seed, device)
+        self.skip = check_choice("skip", skip, ("regret", "free"))
+        self.n_offers = (2 if skip == "regret" else 5) * budget
+        if offers is not None:
+            self.n_offers = check_count("setup.offers", offers, budget)
+        self.on_skip = check_choice("setup.on_skip", on_skip, ("new", "repeat"))
+        self._make_specs(2)
+
+    @property
+    def max_steps(self) -> int:
+        """O: a session that asks less sees every offer."""
+        return self.n_offers
+
+    def _fresh_state(self) -> TensorDict:
+        state = super()._fresh_state()
+        shape = (self.batch_size.numel(), self.n_offers)
+        offers = torch.randint(
+            len(self.features), shape, generator=self.generator, device=self.device
+        )
+        state["offers"] = offers
+        state["n_offered"] = torch.zeros_like(state["n_asked"])
+        return state
+
+    def _offered(self, state: State | TensorDictBase) -> Tensor:
+        """(B), pool index of the query on offer; after the last offer, the last one."""
+        place = state["n_offered" if self.on_skip == "new" else "n_asked"]
+        return state["offers"].gather(-1, place.clamp(max=self.n_offers - 1)).squeeze(-1)
+
+    def _observe(self, state: State) -> None:
+        super()._observe(state)
+        offers_left = 1 - state["n_offered"] / self.n_offers
+        state["remaining"] = torch.cat([state["remaining"], offers_left], -1)
+        state["offer"] = self.features[self._offered(state)]
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = self._check_action(tensordict, 2, "1 to ask and 0 to skip")
+        index = self._offered(tensordict)
+        going_on = (tensordict["n_asked"] < self.budget) & (tensordict["n_offered"] < self.n_offers)
+        asks = (action == 1).unsqueeze(-1)
+        state = self._ask(tensordict, index, (asks & going_on).squeeze(-1))
+        state["n_offered"] = state["n_offered"] + going_on
+        self._observe(state)
+        if self.skip == "free":
+            reward = self._objective.potential(state) - self._objective.potential(tensordict)
+        else:
+            query, model = self.features[index].unsqueeze(1), self.belief.response_model
+            worth = self._objective.forecast(tensordict, query, model) * going_on
+            reward = torch.where(asks, worth, -worth)
+        out_of_offers = state["n_offered"] >= self.n_offers
+        terminated = state["n_asked"] >= self.budget
+        if self.skip == "free":
+            # Scarce offers are part of the task, and nothing is to come after the last.
+            terminated = terminated | out_of_offers
+        return self._finish(state, reward, out_of_offers, terminated)

@@ -1,0 +1,1 @@
+"""Strategies beside each other on the same humans: runs, statistics, tables, figures."""

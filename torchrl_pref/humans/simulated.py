@@ -1,0 +1,77 @@
+"""Who answers the queries.
+
+Shapes: B sessions, H query budget, K options per query, R possible answers, D features.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Generator, Tensor
+
+from torchrl_pref.beliefs.sampled import uniform_sphere
+from torchrl_pref.errors import InputError, check_positive, check_type
+from torchrl_pref.questions.responses import ResponseModel
+from torchrl_pref.tensors import check_finite
+
+
+class SimulatedHuman:
+    """A human with hidden weights ω, uniform on the unit sphere, who answers by a response model.
+
+    All the randomness of the answers is drawn with ω, one draw for each of the H answers to come:
+    two strategies that face the same human also face the same luck, and their difference is paired.
+
+    Args:
+        response_model: how the human answers.
+        spread: humans differ in how careful they are: each one's returns are multiplied by a factor
+            drawn log-uniformly between 1/spread and spread, which a strategy is not told. 1 makes
+            them all alike.
+
+    Raises:
+        InputError: there is no response model, or ``spread`` is not a number from 1 to 10⁶.
+    """
+
+    def __init__(self, response_model: ResponseModel, spread: float = 1.0) -> None:
+        check_type("response_model", response_model, ResponseModel, "Boltzmann(2.0)")
+        self.response_model = response_model
+        self.spread = check_positive("tau_spread", spread)
+        if not 1 <= spread <= 1e6:
+            raise InputError(
+                f"tau_spread={spread}: expected a factor of at least 1, and at most 1e6; 1 is no "
+                "spread"
+            )
+
+    def draw(
+        self, n_sessions: int, budget: int, n_options: int, n_features: int, generator: Generator
+    ) -> TensorDict:
+        """Draw B humans: ``omega`` (B D), standard Gumbel ``noise`` (B H R), ``care`` (B 1)."""
+        omega = uniform_sphere((n_sessions, n_features), generator)
+        shape = (n_sessions, budget, n_options)
+        exponential = torch.empty(shape, device=generator.device).exponential_(generator=generator)
+        noise = -exponential.clamp(min=1e-30).log()
+        exponent = 2 * torch.rand((n_sessions, 1), generator=generator, device=generator.device) - 1
+        human = {"omega": omega, "noise": noise, "care": self.spread**exponent}
+        return TensorDict(human, [n_sessions], device=generator.device)
+
+    def respond(
+        self, queries: Tensor, human: TensorDictBase | Mapping[str, Tensor], turn: Tensor
+    ) -> Tensor:
+        """Pick one option of a query, by the Gumbel-max trick.
+
+        Args:
+            queries: (B K D), features of the options.
+            human: as drawn.
+            turn: (B), how many queries each human has answered before.
+
+        Returns:
+            (B) int64, the index of the chosen option.
+
+        Raises:
+            InputError: the returns are not finite.
+        """
+        returns = (queries @ human["omega"].unsqueeze(-1)).squeeze(-1) * human["care"]
+        check_finite("the human's returns (queries @ omega * care)", returns)
+        noise = torch.take_along_dim(human["noise"], turn[:, None, None], 1).squeeze(1)
+        return (self.response_model(returns) + noise).argmax(-1)

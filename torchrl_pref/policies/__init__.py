@@ -1,0 +1,1 @@
+"""Learned strategies: networks that choose the next query."""

@@ -1,0 +1,223 @@
+"""Query pools: N queries of K options with D features each.
+
+Shapes: N queries, K options per query, D features, T trajectory length.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchrl_pref.errors import InputError
+from torchrl_pref.storage.files import DTYPES, is_dense, load_safely, without_rest
+from torchrl_pref.storage.writing import replacing
+from torchrl_pref.tensors import check_finite, check_plain
+
+
+@dataclass(frozen=True)
+class QueryPool:
+    """A fixed set of queries to choose from.
+
+    Attributes:
+        features: (N K D) float32; a copy of what was given, without its gradients.
+        trajectories: (N K T …), what a person would be shown, or None.
+
+    Raises:
+        InputError: the features are not (N, K ≥ 2, D ≥ 2) finite numbers, or the trajectories do
+            not belong to them or are of a type that cannot be saved.
+    """
+
+    features: Tensor
+    trajectories: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "features", check_features(self.features))
+        if self.trajectories is not None:
+            object.__setattr__(self, "trajectories", self._check_trajectories(self.trajectories))
+
+    def _check_trajectories(self, shown: Any) -> Tensor:
+        """The trajectories as a plain tensor, without gradients."""
+        if not isinstance(shown, Tensor) or shown.layout != torch.strided:
+            raise InputError(
+                f"trajectories of type {type(shown).__name__}: expected a dense torch.Tensor; "
+                "torch.as_tensor(…) makes one of an array or of lists, to_dense() of a sparse one"
+            )
+        if shown.dtype not in DTYPES or shown.is_meta:
+            raise InputError(
+                f"trajectories of {shown.dtype} on {shown.device}: expected plain numbers, which "
+                "can be saved; convert them, as by .float()"
+            )
+        if shown.shape[:2] != self.features.shape[:2]:
+            raise InputError(
+                f"trajectories of shape {tuple(shown.shape)}: expected "
+                f"{tuple(self.features.shape[:2])} as the first two sizes, those of the features"
+            )
+        return shown.detach().as_subclass(Tensor)
+
+    def __len__(self) -> int:
+        return len(self.features)
+
+    @property
+    def n_options(self) -> int:
+        """K."""
+        return self.features.shape[1]
+
+    @property
+    def n_features(self) -> int:
+        """D."""
+        return self.features.shape[2]
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the features and their shape, in hexadecimal: equal pools, equal digests."""
+        content = self.features.contiguous().cpu().numpy()
+        return hashlib.sha256(repr(content.shape).encode() + content.tobytes()).hexdigest()
+
+    def map_features(self, function: Callable[[Tensor], Tensor]) -> QueryPool:
+        """The same queries with other features, such as those of a ``Normalizer``."""
+        return replace(self, features=function(self.features))
+
+    def save(self, path: str | Path) -> None:
+        """Write the pool to a file, whole or not at all."""
+        shown = None if self.trajectories is None else without_rest(self.trajectories)
+        content = {"features": without_rest(self.features), "trajectories": shown}
+        save_atomically({"kind": "query pool", **content}, path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> QueryPool:
+        """Read a pool from a file. No pickled code is ever executed.
+
+        Raises:
+            InputError: the file is missing, cut off, spoiled, or not a query pool.
+        """
+        content = load_safely(path, "query pool")
+        features: Any = content.get("features")
+        shown: Any = content.get("trajectories")
+        if not is_dense(features) or not (shown is None or is_dense(shown)):
+            raise InputError(
+                f"{path}: a query pool without features, or with what is no plain tensor; make it "
+                "again with save()"
+            )
+        try:
+            return cls(features, shown)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+
+
+def save_atomically(content: dict[str, Any], path: str | Path) -> None:
+    """Write plain data and tensors to a file, so that a reader never sees half of it.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    path = Path(path)
+    try:
+        with replacing(path) as partial, partial.open("wb") as file:
+            torch.save(content, file)
+    except (OSError, RuntimeError) as error:  # torch reports a full disk as the latter
+        raise InputError(
+            f"{path}: cannot be written ({error}); free some space there, or name another folder"
+        ) from error
+
+
+def check_features(features: Tensor) -> Tensor:
+    """Return the features of a pool as float32: a copy, without gradients.
+
+    Raises:
+        InputError: they are no plain real numbers, the shape is not (N, K ≥ 2, D ≥ 2), or a value
+            is NaN, infinite, or beyond float32.
+    """
+    check_plain("features", features)
+    shape = tuple(features.shape)
+    if features.ndim != 3 or shape[0] < 1 or shape[1] < 2 or shape[2] < 2:
+        raise InputError(
+            f"features of shape {shape}: expected (N queries, K options, D features) with N at "
+            "least 1, K at least 2 and D at least 2; reshape them or stack the options of a query"
+        )
+    # A copy: what is later written into the tensor that was given is not checked.
+    single = features.detach().as_subclass(Tensor).to(torch.float32, copy=True).contiguous()
+    for bad, what, mend in (
+        (~features.isfinite(), "NaN or infinity", "finite numbers; remove or mend these queries"),
+        (single.isinf(), "numbers beyond float32", "numbers up to 1e38; scale the features"),
+        ((single == 0) & (features != 0), "numbers that are 0 in float32", "larger ones; scale"),
+    ):
+        broken = bad.flatten(1).any(1).nonzero().squeeze(-1)
+        if broken.numel():
+            raise InputError(
+                f"features of {broken.numel()} of {shape[0]} queries hold {what} (first: "
+                f"query {int(broken[0])}): expected {mend}"
+            )
+    return single
+
+
+@dataclass(frozen=True)
+class Normalizer:
+    """Zero mean and unit variance, by the training pool's statistics (the paper's section 4.1).
+
+    Attributes:
+        mean: (D), mean of each feature over all training options.
+        std: (D), standard deviation of each feature, in the feature's unit.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    @classmethod
+    def fit(cls, features: Tensor) -> Normalizer:
+        """Measure the statistics of raw features (… D).
+
+        Raises:
+            InputError: a feature is no finite number, or never varies, so that no scale makes its
+                variance one.
+        """
+        check_finite("features", check_plain("features", features))
+        flat = features.flatten(0, -2).double()
+        mean, std = flat.mean(0), flat.std(0, correction=0)
+        constant = (std <= 1e-6 * (1 + mean.abs())).nonzero().squeeze(-1).tolist()
+        if constant:
+            raise InputError(
+                f"feature {', '.join(map(str, constant))} never varies over the training pool: "
+                "expected features that differ between options; drop it, or use a larger pool"
+            )
+        return cls(mean.float(), std.float())
+
+    def __call__(self, features: Tensor) -> Tensor:
+        """Normalise raw features (… D).
+
+        Raises:
+            InputError: D is not the number of features that this was fitted on.
+        """
+        if features.shape[-1] != len(self.mean):
+            raise InputError(
+                f"features with D={features.shape[-1]}: expected D={len(self.mean)}, as in the "
+                "training pool; use the feature map that the training pool was made with"
+            )
+        return (features - self.mean) / self.std
+
+
+def balance(features: Tensor) -> Callable[[Tensor], Tensor]:
+    """A linear map after which a pool's options differ equally in every direction.
+
+    Some directions of ω show in hardly any query of a pool. After this map, fitted on the pool's
+    features (N K D), the options of a query differ by the same variance in all D directions.
+
+    Raises:
+        InputError: a feature is no finite number, or the options do not differ in some direction
+            at all.
+    """
+    check_finite("features", check_plain("features", features))
+    gaps = (features - features.mean(1, keepdim=True)).flatten(0, 1).double()
+    variances, directions = torch.linalg.eigh(gaps.mT @ gaps / len(gaps))
+    if variances[0] <= 1e-10 * variances[-1]:
+        raise InputError(
+            "features cannot be balanced: the options of a query never differ in some direction; "
+            "expected D linearly independent features; drop those that follow from the others"
+        )
+    matrix = (directions / variances.sqrt()) @ directions.mT
+    return lambda raw: raw @ matrix.to(raw)

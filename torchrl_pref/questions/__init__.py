@@ -1,0 +1,1 @@
+"""What can be answered, and how likely each answer is."""

@@ -1,0 +1,157 @@
+"""The paper's Gridworld as a batched TorchRL environment, and random trajectories from it.
+
+Shapes: B parallel walks, T trajectory length.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Generator, Tensor
+from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from torchrl_pref.errors import check_count
+from torchrl_pref.pool import QueryPool
+
+MOVES = ((-1, 0), (1, 0), (0, -1), (0, 1))
+"""Change of (row, column) for each of the four actions: up, down, left, right."""
+
+
+class Gridworld(EnvBase):
+    """A square grid: two-dimensional state, one-dimensional action, deterministic, walls stop you.
+
+    The start is uniform over the cells. There is no reward: which walk is better is for the human
+    to say. An episode is truncated after ``length`` actions.
+
+    Args:
+        size: cells along an edge, at least 2.
+        length: T, actions in an episode, at least 1.
+        batch_size: (B,), walks that run side by side.
+        seed: seeds the environment's own generator; the global generators are never used.
+        device: where the tensors live.
+
+    Raises:
+        InputError: ``size`` or ``length`` is too small.
+    """
+
+    def __init__(
+        self,
+        size: int = 8,
+        length: int = 20,
+        batch_size: tuple[int, ...] = (64,),
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        super().__init__(device=device, batch_size=torch.Size(batch_size))
+        self.size = check_count("grid.size", size, 2)
+        self.length = check_count("grid.length", length, 1)
+        self.register_buffer("moves", torch.tensor(MOVES, device=device))
+        self._set_seed(seed)
+        batch = self.batch_size
+        self.observation_spec = Composite(
+            position=Bounded(0, size - 1, shape=(*batch, 2), dtype=torch.int64, device=device),
+            step_count=Unbounded(shape=(*batch, 1), dtype=torch.int64, device=device),
+            shape=batch,
+        )
+        self.state_spec = self.observation_spec.clone()
+        self.action_spec = Categorical(len(MOVES), shape=batch, device=device)
+        self.reward_spec = Unbounded(shape=(*batch, 1), device=device)
+        flag = Binary(n=1, shape=(*batch, 1), dtype=torch.bool, device=device)
+        self.done_spec = Composite(
+            done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=batch
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        self._generator = Generator(self.device).manual_seed(0 if seed is None else seed)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        shape = (*self.batch_size, 2)
+        position = torch.randint(
+            self.size, shape, generator=self._generator, device=self._generator.device
+        ).to(self.device)
+        count = torch.zeros((*self.batch_size, 1), dtype=torch.int64, device=self.device)
+        return TensorDict(
+            {"position": position, "step_count": count}, self.batch_size, device=self.device
+        )
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        position = tensordict["position"] + self.moves[tensordict["action"]]
+        count = tensordict["step_count"] + 1
+        truncated = count >= self.length
+        return TensorDict(
+            {
+                "position": position.clamp(0, self.size - 1),
+                "step_count": count,
+                "reward": torch.zeros(truncated.shape, device=self.device),
+                "done": truncated,
+                "terminated": torch.zeros_like(truncated),
+                "truncated": truncated.clone(),
+            },
+            self.batch_size,
+            device=self.device,
+        )
+
+
+def random_walks(count: int, size: int = 8, length: int = 20, seed: int = 0) -> Tensor:
+    """Roll out uniformly random moves.
+
+    Args:
+        count: how many walks.
+        size: cells along an edge.
+        length: T, cells in a walk, the start included.
+        seed: fixes the starts and the moves.
+
+    Returns:
+        (count T 2) int64, the cells in which the T actions were taken.
+    """
+    env = Gridworld(size, length, (count,), seed)
+    generator = Generator().manual_seed(seed + 1)
+
+    def random_move(position: Tensor) -> Tensor:
+        return torch.randint(len(MOVES), position.shape[:-1], generator=generator)
+
+    policy = TensorDictModule(random_move, in_keys=["position"], out_keys=["action"])
+    return env.rollout(length, policy)["position"]
+
+
+def corner_distances(positions: Tensor, size: int) -> Tensor:
+    """The paper's four features (section 4.1): mean distance to each corner of the Gridworld.
+
+    Args:
+        positions: (… T 2), cells visited, from 0 to ``size`` - 1.
+        size: cells along an edge.
+
+    Returns:
+        (… 4), Euclidean distances in cells, averaged over the trajectory.
+    """
+    edge = float(size - 1)
+    corners = torch.tensor([[0.0, 0.0], [0.0, edge], [edge, 0.0], [edge, edge]])
+    offsets = positions.float().unsqueeze(-2) - corners.to(positions.device)
+    return offsets.norm(dim=-1).mean(-2)
+
+
+def gridworld_pool(
+    n_queries: int = 1000, n_options: int = 2, size: int = 8, length: int = 20, seed: int = 0
+) -> QueryPool:
+    """The paper's pool: K random walks a query, mean distances to the corners, not normalised.
+
+    Args:
+        n_queries: N, at least 1.
+        n_options: K, at least 2.
+        size: cells along an edge of the Gridworld.
+        length: T, cells in a walk.
+        seed: fixes the pool.
+
+    Raises:
+        InputError: a number is below its minimum.
+    """
+    check_count("pool.size", n_queries, 1)
+    check_count("pool.options", n_options, 2)
+    walks = random_walks(n_queries * n_options, size, length, seed)
+    features = corner_distances(walks, size)
+    shape = (n_queries, n_options)
+    return QueryPool(features.unflatten(0, shape), walks.unflatten(0, shape))

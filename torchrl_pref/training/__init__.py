@@ -1,0 +1,1 @@
+"""How a policy learns: sessions, updates, what is logged of them."""

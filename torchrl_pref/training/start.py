@@ -1,0 +1,46 @@
+"""A training from its settings, and the checkpoint of it as it stands."""
+
+from __future__ import annotations
+
+import torch
+
+from torchrl_pref.build import (
+    Settings,
+    Task,
+    make_policy,
+    make_training_env,
+)
+from torchrl_pref.checkpoints.checkpoint import Checkpoint
+from torchrl_pref.errors import check_seed
+from torchrl_pref.training.a2c import A2CSettings, Trainer
+
+
+def make_trainer(settings: Settings, task: Task) -> Trainer:
+    """Environment, policy and A2C of a run, ready for its first update.
+
+    Raises:
+        InputError: a setting is out of range.
+    """
+    a2c = A2CSettings(**settings["training"])
+    seed = check_seed("seed", settings["seed"])
+    env = make_training_env(settings, task, task.train, a2c.sessions, seed)
+    # The policy's initial weights come from the global generator.
+    torch.manual_seed(seed)
+    return Trainer(env, make_policy(settings, env), a2c, seed)
+
+
+def make_checkpoint(settings: Settings, task: Task, trainer: Trainer) -> Checkpoint:
+    """Everything about a run as it stands."""
+    train = task.train
+    shape = {"N": len(train), "K": train.n_options, "D": train.n_features}
+    return Checkpoint(
+        settings=settings,
+        tau=task.tau,
+        mean=task.normalizer.mean,
+        std=task.normalizer.std,
+        train_digest=train.digest,
+        test_digest=task.test.digest,
+        pool_shape=shape,
+        weights=trainer.average,
+        training=trainer.state_dict(),
+    )

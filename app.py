@@ -24,6 +24,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 import typed
 from torchrl_pref import runs, sweeps
+from torchrl_pref.config.settings import open_groups
 from torchrl_pref.errors import InputError, one_line_errors
 
 
@@ -45,6 +46,7 @@ def main(job: Callable[[], Any], check: Callable[[dict[str, Any]], None]) -> Non
     path = [str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])]
     os.environ["PYTHONPATH"] = os.pathsep.join(path)
     signal.signal(signal.SIGTERM, _terminate)
+    sys.argv[1:] = typed.told_hydra(sys.argv[1:])
     typed.Gate.check, typed.Gate.passed, typed.Gate.made = check, False, ()
     with unbroken_output(), one_line_errors():
         try:
@@ -99,6 +101,48 @@ class _Unbroken:
             os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
             written = len(text)
         return written
+
+
+def allow_typed(settings: dict[str, Any]) -> None:
+    """Let the code be imported that the user typed, as in ``policy=mine:make``."""
+    typed_by_user = [group for group in typed.GROUPS if typed.was_typed(f"{group}.make")]
+    if typed_by_user:
+        from torchrl_pref.groups import allow
+
+        for group in typed_by_user:
+            allow(settings[group]["make"])
+
+
+def refuse_other_code(settings: dict[str, Any], new: dict[str, Any]) -> None:
+    """Refuse code of the user's own that a run was not made with.
+
+    Args:
+        settings: of the run.
+        new: as typed.
+
+    Raises:
+        InputError: a group names other code there.
+    """
+    for group in typed.GROUPS:
+        if typed.was_typed(f"{group}.make"):
+            there, here = settings[group].get("make"), new[group]["make"]
+            if there != here:
+                raise InputError(
+                    f"{group}={here}: the run was made with {group}="
+                    f"{there or settings[group]['name']}; type that, or leave {group} out"
+                )
+
+
+def check_groups(settings: dict[str, Any]) -> None:
+    """Make what the groups choose, where no table can check it: that takes the heavy imports.
+
+    Raises:
+        InputError: something cannot be made.
+    """
+    if open_groups(settings):
+        from torchrl_pref.build import check_groups
+
+        check_groups(settings)
 
 
 def use_threads(settings: dict[str, Any]) -> None:

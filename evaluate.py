@@ -37,7 +37,7 @@ PROTOCOL_KEYS = (
     "setup.budget",
     "setup.offers",
     "belief.",
-    "grid.",
+    "task.",
     "pool.size",
     "pool.options",
     "pool.seed",
@@ -85,6 +85,8 @@ def check(settings: dict[str, Any]) -> None:
         allowed = ("evaluation.", "pool.test", "device", "threads", "hydra.")
         typed.refuse_other_overrides("checkpoint", allowed)
     check_evaluate_settings(settings)
+    app.allow_typed(settings)
+    app.check_groups(settings)
 
 
 def evaluate(settings: dict[str, Any], folder: Path) -> None:
@@ -122,7 +124,7 @@ def evaluate_taus(
 
     pools = build.make_pools(settings)
     taus = listed(settings["tau"])
-    tasks = [(build.make_task(*pools, tau), learned_for(tau)) for tau in taus]
+    tasks = [(build.make_task(*pools, tau, settings), learned_for(tau)) for tau in taus]
     panels: Panels = {}
     for task, learned in tasks:
         panels |= comparison.evaluate_panels(settings, task, learned)
@@ -135,7 +137,7 @@ def pretrained_for(settings: dict[str, Any], tau: Any) -> dict[str, Checkpoint]:
     from torchrl_pref.pretrained import pretrained_checkpoint
 
     checkpoint = pretrained_checkpoint(settings["setup"]["name"], tau)
-    for section in ("setup", "belief", "skip", "tau_spread", "device"):
+    for section in ("setup", "belief", "skip", "human", "question", "device"):
         checkpoint.settings[section] = settings[section]
     return {f"{label_of(checkpoint.settings)} (pretrained)": checkpoint}
 

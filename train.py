@@ -47,9 +47,12 @@ def check(settings: dict[str, Any]) -> None:
         InputError: a setting is out of range, or was typed where a checkpoint decides.
     """
     check_train_settings(settings)
+    app.allow_typed(settings)
+    app.check_groups(settings)
     if settings["resume"] is not None:
+        own = tuple(group for group in typed.GROUPS if typed.was_typed(f"{group}.make"))
         allowed = ("training.updates", "device", "threads", "hydra.")
-        typed.refuse_other_overrides("resume", allowed)
+        typed.refuse_other_overrides("resume", allowed, own)
 
 
 def run(config: DictConfig, made: Path) -> float:
@@ -163,7 +166,7 @@ def start(folder: Path, settings: dict[str, Any]) -> float:
     app.use_threads(settings)
     pools = build.make_pools(settings)
     check_memory(settings, *pools[0].features.shape)
-    task = build.make_task(*pools, settings["tau"])
+    task = build.make_task(*pools, settings["tau"], settings)
     trainer = make_trainer(settings, task)
     comparison.check_evaluation(settings)
     source = settings["checkpoint"]
@@ -198,6 +201,7 @@ def go_on(folder: Path, new: dict[str, Any]) -> float:
         others = [o for o in settings["overrides"] if not o.startswith("training.updates=")]
         settings["overrides"] = [*others, f"training.updates={updates}"]
     check_run(settings)
+    app.refuse_other_code(settings, new)
     if checkpoint is None:
         print(f"{folder}: was stopped before its first checkpoint and starts again")
         return start(folder, settings)

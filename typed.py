@@ -23,6 +23,9 @@ from torchrl_pref.errors import InputError, one_line_errors
 
 Settings = dict[str, Any]
 
+GROUPS = ("policy", "task", "question", "human", "belief")
+"""Groups of which ``<group>=<module>:<name>`` chooses something of the user's own."""
+
 
 class Gate(Callback):
     """Refuses what was typed before Hydra makes a folder for it."""
@@ -134,6 +137,21 @@ def checked_flags() -> Iterator[None]:
         argparse.ArgumentParser.error = before  # type: ignore[method-assign]
 
 
+def told_hydra(arguments: list[str]) -> list[str]:
+    """``policy=mine:make policy.width=9`` as Hydra is to be told it: the group's ``own``, what
+    makes it, and settings that no file of ours knows."""
+    code = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
+    pairs = [argument.partition("=") for argument in arguments]
+    own = [group for group, _, value in pairs if group in GROUPS and code.fullmatch(value)]
+    told: list[str] = []
+    for argument, (key, _, value) in zip(arguments, pairs, strict=True):
+        if key in own and code.fullmatch(value):
+            told += [f"{key}=own", f"{key}.make={value}"]
+        else:
+            told.append(f"++{argument}" if key.partition(".")[0] in own else argument)
+    return told
+
+
 def plain_settings(config: DictConfig) -> Settings:
     """The composed configuration as plain values.
 
@@ -144,7 +162,7 @@ def plain_settings(config: DictConfig) -> Settings:
     settings = OmegaConf.to_container(own, resolve=True)
     assert isinstance(settings, dict)
     choices = HydraConfig.get().runtime.choices
-    for group in ("setup", "policy"):
+    for group in ("setup", *GROUPS):
         section, chosen = settings.get(group), choices.get(group)
         name = section.get("name", chosen) if isinstance(section, dict) else chosen
         if isinstance(chosen, str) and name != chosen:
@@ -164,19 +182,23 @@ def was_typed(key: str) -> bool:
     return any(override.split("=")[0].lstrip("+") == key for override in typed_overrides())
 
 
-def refuse_other_overrides(source: str, allowed: tuple[str, ...]) -> None:
+def refuse_other_overrides(
+    source: str, allowed: tuple[str, ...], own: tuple[str, ...] = ()
+) -> None:
     """Refuse to ignore what the user typed where a checkpoint decides.
 
     Args:
         source: the key that names the checkpoint.
         allowed: keys, or sections ending in a dot, that may be typed beside it.
+        own: groups of which the user brings what is chosen.
 
     Raises:
         InputError: another key was typed.
     """
     for override in typed_overrides():
         key = override.split("=")[0].lstrip("+~")
-        if key != source and not key.startswith(allowed):
+        named = key.partition(".")[0] in own
+        if key != source and not key.startswith(allowed) and not named:
             raise InputError(
                 f"{override}: {source}=… brings its own settings and only "
                 f"{', '.join(allowed)} may be typed beside it; remove {key}, or drop {source}"

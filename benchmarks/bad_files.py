@@ -66,7 +66,7 @@ LIMIT = 4 * 2**30
 LOG = Path("training.csv")
 
 SIZES = (
-    *("setup=feed", "setup.budget=4", "pool.size=30", "belief.samples=10", "tau_spread=1.0"),
+    *("setup=feed", "setup.budget=4", "pool.size=30", "belief.samples=10", "human.spread=1.0"),
     *("training.sessions=4", "training.updates=3", "training.steps=20", "training.warm_up=1"),
 )
 
@@ -123,7 +123,7 @@ def make_run(folder: Path) -> None:
         settings.pop(key)
     settings["overrides"] = list(SIZES)
     pools = build.make_pools(settings)
-    task = build.make_task(*pools, settings["tau"])
+    task = build.make_task(*pools, settings["tau"], settings)
     trainer = make_trainer(settings, task)
     folder.mkdir(parents=True)
     pools[0].save(folder / "train_pool.pt")

@@ -191,7 +191,7 @@ ODD = {
         "pool.train=. pool.test=.",
         "training.sessions=1000000 belief.samples=1000000",
         "setup.budget=100000 setup.offers=100000",
-        "pool.size=100000000 grid.length=1000",
+        "pool.size=100000000 task.length=1000",
         "belief.moves=100000000",
         "objective=entropy belief.samples=200000",
         "setup=query policy=attention setup.candidates=null pool.size=1000000",

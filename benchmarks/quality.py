@@ -26,7 +26,14 @@ from torch import Tensor
 from tqdm import tqdm
 
 from benchmarks import common
-from torchrl_pref.build import load_policy, make_feed_env, make_pools, make_query_env, make_task
+from torchrl_pref.build import (
+    draw_pool,
+    load_policy,
+    make_feed_env,
+    make_pools,
+    make_query_env,
+    make_task,
+)
 from torchrl_pref.checkpoints.checkpoint import Checkpoint
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
@@ -36,7 +43,6 @@ from torchrl_pref.evaluation.reports import signed
 from torchrl_pref.evaluation.run import draw_humans
 from torchrl_pref.evaluation.statistics import two_way_interval
 from torchrl_pref.pretrained import SEEDS, pretrained_checkpoint
-from torchrl_pref.tasks.gridworld import gridworld_pool
 
 FIRST_SEED = FIRST_EVALUATION_SEED + 60_000
 """Of the pools and humans; another one by ``--seed``, to tune on."""
@@ -89,10 +95,9 @@ def run_pool(job: Job) -> list[list[list[float]]]:
     common.one_thread()
     shipped = [pretrained_checkpoint(job.cell.setup, str(job.cell.tau), s) for s in range(SEEDS)]
     settings = shipped[0].settings
-    grid, pool = settings["grid"], settings["pool"]
     train, _ = make_pools(settings)
-    test = gridworld_pool(pool["size"], pool["options"], grid["size"], grid["length"], job.pool)
-    task = make_task(train, test, job.cell.tau)
+    test = draw_pool(settings, job.pool)
+    task = make_task(train, test, job.cell.tau, settings)
     make = make_feed_env if job.cell.setup == "feed" else make_query_env
 
     def make_env(sessions: int) -> QueryEnv | FeedEnv:

@@ -64,7 +64,7 @@ def settings_of(setup: str, tau: str, *overrides: str) -> dict[str, Any]:
 def evaluated(setup: str, tau: str) -> dict[str, dict[str, Any]]:
     """By strategy: a digest of its curves, and its alignment in the end."""
     settings = settings_of(setup, tau)
-    task = make_task(*make_pools(settings), tau)
+    task = make_task(*make_pools(settings), tau, settings)
     checkpoint = pretrained_checkpoint(setup, tau)
     checkpoint.settings["setup"]["budget"] = settings["setup"]["budget"]
     if setup == "feed":
@@ -84,7 +84,7 @@ def evaluated(setup: str, tau: str) -> dict[str, dict[str, Any]]:
 def trained(setup: str, tau: str) -> dict[str, Any]:
     """A digest of the weights that a short training ends with, and its last alignment."""
     settings = settings_of(setup, tau, *SHORT)
-    task = make_task(*make_pools(settings), tau)
+    task = make_task(*make_pools(settings), tau, settings)
     trainer = make_trainer(settings, task)
     # The folder stays: a logger's thread may write into it later.
     trainer.run(Path(tempfile.mkdtemp()), lambda: None)

@@ -48,6 +48,13 @@ def session_of(env: QueryEnv | FeedEnv) -> TensorDictBase:
     return env.rollout(1, ask)[:, -1]["next"].exclude("reward")
 
 
+OF_POLICY: dict[str, dict[str, Any]] = {
+    "scorer": {"start": None},
+    "attention": {"tokens": "samples"},
+    "paper": {},
+}
+
+
 def settings_of(setup: str = "feed", policy: str = "scorer", **training: Any) -> dict[str, Any]:
     return {
         "tau": "noisy",
@@ -57,12 +64,13 @@ def settings_of(setup: str = "feed", policy: str = "scorer", **training: Any) ->
         "overrides": [],
         "objective": "alignment",
         "skip": "free",
-        "tau_spread": 1,
-        "grid": {"size": 8, "length": 20},
+        "human": {"name": "simulated", "spread": 1, "lapse": 0.0},
+        "question": {"name": "choice"},
+        "task": {"name": "gridworld", "size": 8, "length": 20},
         "pool": {"size": 30, "options": 2, "seed": 0, "train": None, "test": None},
-        "belief": {"samples": 10, "moves": 1},
+        "belief": {"name": "sampled", "samples": 10, "moves": 1, "lapse": 0.0},
         "evaluation": {"humans": 5, "seed": 1},
-        "policy": {"name": policy, "sample": False, "start": None, "tokens": "samples"},
+        "policy": {"name": policy, "sample": False, **OF_POLICY[policy]},
         "setup": {
             "name": setup,
             "budget": 4,
@@ -93,7 +101,7 @@ def settings_of(setup: str = "feed", policy: str = "scorer", **training: Any) ->
 
 
 def trainer_of(settings: dict[str, Any]) -> tuple[Trainer, Any]:
-    task = make_task(*make_pools(settings), settings["tau"])
+    task = make_task(*make_pools(settings), settings["tau"], settings)
     return make_trainer(settings, task), task
 
 

@@ -23,6 +23,7 @@ ORDER = [
     "strategies",
     "policies",
     "runs",
+    "groups",
     "checkpoints",
     "build",
     "evaluation",

@@ -262,7 +262,7 @@ BAD_INPUT = [
     ("train", "setup=query policy.start=fun", "policy.start='fun': expected one of"),
     ("train", "policy.start=alignment", "starts from the quantile rule; leave policy.start out"),
     ("train", "policy=attention policy.tokens=all", "policy.tokens='all': expected one of"),
-    ("train", "tau_spread=0.5", "tau_spread=0.5: expected a factor of at least 1"),
+    ("train", "human.spread=0.5", "human.spread=0.5: expected a factor of at least 1"),
     ("train", "training.warm_up=-1", "training.warm_up=-1: expected a whole number"),
     ("evaluate", "protocol=all", "protocol='all': expected one of heldout"),
     ("evaluate", "policy=best", "Could not find 'policy/best'"),

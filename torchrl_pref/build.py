@@ -7,27 +7,26 @@ things and are never code to call, so that a foreign checkpoint can do no harm.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from torchrl_pref.beliefs.sampled import Belief, uniform_sphere
+from torchrl_pref.beliefs.sampled import uniform_sphere
 from torchrl_pref.checkpoints.checkpoint import Checkpoint, picks_by_index
 from torchrl_pref.checkpoints.restore import restore_weights
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
-from torchrl_pref.errors import InputError, check_choice, check_positive, check_seed
-from torchrl_pref.humans.simulated import SimulatedHuman
-from torchrl_pref.policies.attention import attention_policy
+from torchrl_pref.errors import InputError, check_positive, check_seed
+from torchrl_pref.groups import OWN, find, make
 from torchrl_pref.policies.base import Policy
-from torchrl_pref.policies.paper import paper_policy
-from torchrl_pref.policies.scorer import scorer_policy
 from torchrl_pref.pool import Normalizer, QueryPool
+from torchrl_pref.questions.base import Question
 from torchrl_pref.questions.calibrate import calibrate_tau
+from torchrl_pref.questions.choice import Choice
 from torchrl_pref.questions.responses import Boltzmann, Optimal, ResponseModel
-from torchrl_pref.tasks.gridworld import gridworld_pool
+from torchrl_pref.tasks.base import make_pool
 
 Settings = dict[str, Any]
 
@@ -43,12 +42,18 @@ class Task:
         train, test: the pools, normalised by the training pool's statistics.
         normalizer: those statistics.
         tau: of the simulated human; None for an optimal one.
+        question: what is asked.
+        human_lapse, belief_lapse: share of answers that are given at random, and that the belief
+            takes to be.
     """
 
     train: QueryPool
     test: QueryPool
     normalizer: Normalizer
     tau: float | None
+    question: Question = field(default_factory=Choice)
+    human_lapse: float = 0.0
+    belief_lapse: float = 0.0
 
     @property
     def title(self) -> str:
@@ -57,27 +62,71 @@ class Task:
 
     @property
     def response_model(self) -> ResponseModel:
-        """How the human answers and how the belief thinks they do."""
-        return Optimal() if self.tau is None else Boltzmann(self.tau)
+        """How the belief thinks that the human answers."""
+        return response_model(self.tau, self.question, self.belief_lapse)
+
+    @property
+    def human_model(self) -> ResponseModel:
+        """How the human answers."""
+        return response_model(self.tau, self.question, self.human_lapse)
+
+
+def check_groups(settings: Settings) -> None:
+    """Refuse groups that cannot be made, before anything else is.
+
+    Raises:
+        InputError: one cannot.
+    """
+    own_pools = settings["pool"]["train"] is not None
+    n_options = None if own_pools else settings["pool"]["options"]
+    question = make("question", settings["question"])
+    if n_options is not None:
+        question.answers(n_options)
+        make("task", settings["task"])
+    taus = settings["tau"] if isinstance(settings["tau"], list) else [settings["tau"]]
+    for tau in taus:
+        number = None if tau == "optimal" else 1.0 if tau == "noisy" else float(tau)
+        for section in ("human", "belief"):
+            lapse = settings[section]["lapse"]
+            model = response_model(number, question, lapse)
+            make(section, settings[section], model, without=("lapse",))
+    if settings.get("policy", {}).get("name") == OWN:
+        find("policy", settings["policy"])
+
+
+def response_model(tau: float | None, question: Question, lapse: float) -> ResponseModel:
+    """How someone answers; tau is None for one who never errs.
+
+    Raises:
+        InputError: a number is out of range, or there is no such human.
+    """
+    if tau is not None:
+        return Boltzmann(tau, question, lapse)
+    if question != Choice():
+        raise InputError(
+            f"tau=optimal with {question!r}: a human who never errs finds nothing about equal; "
+            "expected question=choice, or another tau"
+        )
+    return Optimal(lapse=lapse)
 
 
 def make_pools(settings: Settings) -> tuple[QueryPool, QueryPool]:
-    """Training and test pool, not normalised: of files where they are named, else of Gridworld.
+    """Training and test pool, not normalised: of files where they are named, else of the task.
 
     Args:
-        settings: the sections ``grid`` and ``pool``.
+        settings: the sections ``task`` and ``pool``.
 
     Raises:
         InputError: a setting or a file cannot be used.
     """
-    pool, grid = settings["pool"], settings["grid"]
+    pool = settings["pool"]
     given = [name for name in ("train", "test") if pool[name] is not None]
     if len(given) == 1:
         raise InputError(
-            f"pool.{given[0]}={pool[given[0]]} alone: the other pool would be the Gridworld's; "
+            f"pool.{given[0]}={pool[given[0]]} alone: the other pool would be the task's; "
             "expected both pool.train and pool.test of your own, or neither"
         )
-    # Each pool takes two seeds, one for the starts and one for the moves.
+    # Each pool takes two seeds.
     first_seed = 4 * check_seed("pool.seed", pool["seed"])
     if first_seed >= 2**31:
         raise InputError(f"pool.seed={pool['seed']}: expected a whole number below {2**29}")
@@ -86,17 +135,25 @@ def make_pools(settings: Settings) -> tuple[QueryPool, QueryPool]:
         if path is not None:
             pools.append(QueryPool.load(str(path)))
         else:
-            size, length = grid["size"], grid["length"]
-            pools.append(gridworld_pool(pool["size"], pool["options"], size, length, seed))
+            pools.append(draw_pool(settings, seed))
     return pools[0], pools[1]
 
 
-def make_task(train: QueryPool, test: QueryPool, tau: Any) -> Task:
+def draw_pool(settings: Settings, seed: int) -> QueryPool:
+    """A pool of the task, not normalised, by the sections ``task`` and ``pool``."""
+    task = make("task", settings["task"])
+    return make_pool(task, settings["pool"]["size"], settings["pool"]["options"], seed)
+
+
+def make_task(
+    train: QueryPool, test: QueryPool, tau: Any, settings: Settings | None = None
+) -> Task:
     """Fit the normaliser on the training pool, normalise both, solve for tau.
 
     Args:
         train, test: the pools, not normalised.
         tau: ``noisy``, ``optimal`` or a positive number.
+        settings: the sections ``question``, ``human`` and ``belief``; None: a choice, no lapses.
 
     Raises:
         InputError: the pools do not belong together, a feature never varies, or tau is another
@@ -121,7 +178,14 @@ def make_task(train: QueryPool, test: QueryPool, tau: Any) -> Task:
         solved = calibrate_tau(returns, NOISY_ACCURACY)
     else:
         solved = float(tau)
-    return Task(train, test, normalizer, solved)
+    if settings is None:
+        return Task(train, test, normalizer, solved)
+    question = make("question", settings["question"])
+    question.answers(train.n_options)  # or it is refused here
+    lapses = (settings[section]["lapse"] for section in ("human", "belief"))
+    task = Task(train, test, normalizer, solved, question, *lapses)
+    _ = task.human_model, task.response_model
+    return task
 
 
 def reload_task(checkpoint: Checkpoint, train: Path, test: Path) -> Task:
@@ -135,7 +199,7 @@ def reload_task(checkpoint: Checkpoint, train: Path, test: Path) -> Task:
         pools = QueryPool.load(train), QueryPool.load(test)
     else:
         pools = make_pools(settings)
-    task = make_task(*pools, settings["tau"])
+    task = make_task(*pools, settings["tau"], settings)
     for name, pool, digest in (
         ("train", task.train, checkpoint.train_digest),
         ("test", task.test, checkpoint.test_digest),
@@ -194,8 +258,8 @@ def _session_arguments(settings: Settings, task: Task, sessions: int, seed: int)
     """What both environments are made with."""
     belief = settings["belief"]
     return {
-        "human": SimulatedHuman(task.response_model, settings["tau_spread"]),
-        "belief": Belief(task.response_model, belief["samples"], belief["moves"]),
+        "human": make("human", settings["human"], task.human_model, without=("lapse",)),
+        "belief": make("belief", belief, task.response_model, without=("lapse",)),
         "budget": settings["setup"]["budget"],
         "objective": settings["objective"],
         "batch_size": (sessions,),
@@ -206,16 +270,11 @@ def _session_arguments(settings: Settings, task: Task, sessions: int, seed: int)
 
 def make_policy(settings: Settings, env: QueryEnv | FeedEnv) -> Policy:
     """The policy of the setting ``policy``, untrained, to fit an environment."""
-    chosen = settings["policy"]
-    name = check_choice("policy", chosen["name"], ("scorer", "attention", "paper"))
-    if name == "attention":
-        return attention_policy(env, chosen["tokens"])
-    if name == "paper":
-        return paper_policy(env)
-    start = chosen["start"]
-    if start is None and isinstance(env, QueryEnv):
-        start = settings["objective"]  # as trained, whatever the environment's own is
-    return scorer_policy(env, start)
+    section = settings["policy"]
+    if section.get("start", ...) is None and settings["setup"]["name"] == "query":
+        section = {**section, "start": settings["objective"]}  # as trained, whatever env rewards
+    made: Policy = make("policy", section, env, without=("sample",))
+    return made
 
 
 def check_device(name: Any) -> torch.device:

@@ -75,7 +75,7 @@ def test_words_are_those_of_the_library() -> None:
         ("training.sessions", 10**8, "training"),
         ("belief.samples", 10**9, "training"),
         ("pool.size", 10**9, "the evaluation"),
-        ("grid.length", 2**32, "the pools"),
+        ("task.length", 2**32, "the pools"),
         ("setup.budget", 10**9, "training"),
         ("training.steps", 10**9, "training"),
         ("belief.moves", 10**9, "moving the belief"),

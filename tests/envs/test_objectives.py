@@ -160,5 +160,5 @@ def test_humans_of_a_spread_differ_in_care(pool: QueryPool) -> None:
     right = human.respond(queries, drawn, torch.zeros(4000, dtype=torch.long)) == returns.argmax(-1)
     careful = drawn["care"].squeeze(-1) > 1
     assert right[careful].float().mean() > right[~careful].float().mean() + 0.05
-    with pytest.raises(InputError, match=r"tau_spread=0.5"):
+    with pytest.raises(InputError, match=r"spread=0.5"):
         SimulatedHuman(model, spread=0.5)

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import torch
 from helpers import settings_of, trainer_of
-from torch import Generator
+from torch import Generator, Tensor
 
 from torchrl_pref.build import make_pools, make_task
 from torchrl_pref.checkpoints.checkpoint import Checkpoint
@@ -17,9 +17,9 @@ from torchrl_pref.evaluation.heldout import Cell, Job, Outcome, run_protocol, ru
 from torchrl_pref.evaluation.heldout_report import paired, reaches, write_heldout
 from torchrl_pref.evaluation.run import draw_humans
 from torchrl_pref.evaluation.statistics import two_way_interval
-from torchrl_pref.pool import Normalizer, QueryPool, balance
+from torchrl_pref.pool import Normalizer, balance
 from torchrl_pref.strategies import RandomAsk
-from torchrl_pref.tasks.gridworld import gridworld_pool
+from torchrl_pref.tasks.gridworld import GridworldTask, gridworld_pool
 from torchrl_pref.training.start import make_checkpoint
 
 
@@ -123,12 +123,13 @@ def test_no_two_pools_share_a_seed(monkeypatch: pytest.MonkeyPatch) -> None:
     """A pool takes its seed for the starts and the next one for the moves."""
     seeds: list[int] = []
 
-    def watched(n_queries: int, n_options: int, size: int, length: int, seed: int) -> QueryPool:
-        seeds.extend((seed, seed + 1))
-        return gridworld_pool(n_queries, n_options, size, length, seed)
+    trajectories = GridworldTask.trajectories
 
-    monkeypatch.setattr(heldout, "gridworld_pool", watched)
-    monkeypatch.setattr("torchrl_pref.build.gridworld_pool", watched)
+    def watched(task: GridworldTask, count: int, seed: int) -> Tensor:
+        seeds.extend((seed, seed + 1))
+        return trajectories(task, count, seed)
+
+    monkeypatch.setattr(GridworldTask, "trajectories", watched)
     for pool in range(heldout.POOLS):
         heldout._task_and_pool(Job(settings_of("feed"), Cell("feed", "noisy"), pool))
     per_call = 2 * 3  # training, test, and the pool itself

@@ -14,12 +14,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
 
 import torch
 from torch import Generator, Tensor
 from torch.nn import functional as F
 
+from torchrl_pref.beliefs.base import BeliefBase, Update
 from torchrl_pref.beliefs.resampling import kish_share, resample
 from torchrl_pref.beliefs.slice import Target, round_of_moves
 from torchrl_pref.config.memory import default_moves
@@ -58,18 +58,7 @@ def uniform_sphere(shape: tuple[int, ...], generator: Generator) -> Tensor:
     return F.normalize(normal, dim=-1)
 
 
-class Update(NamedTuple):
-    """What an answer makes of the belief."""
-
-    samples: Tensor
-    """(S M D), samples of the posterior."""
-    ess: Tensor
-    """(S), effective sample size of the mean, between 1 and M."""
-    used: Tensor
-    """(S) bool, False where the answer contradicts the earlier ones and was left out."""
-
-
-class Belief:
+class Belief(BeliefBase):
     """Posterior samples of ω under an assumed response model.
 
     Args:
@@ -99,7 +88,7 @@ class Belief:
     def update(
         self, samples: Tensor, ess: Tensor, answers: Evidence, generator: Generator
     ) -> Update:
-        r"""Condition on one more answer per session.
+        r"""See :meth:`BeliefBase.update`.
 
         Reweighting by an answer that few samples agree with would leave copies of a handful; a hard
         answer could leave none. The answer is then let in by stages: its return gaps are raised by
@@ -116,16 +105,6 @@ class Belief:
         which a share of the variance is still explained by the places before leave that share of
         the excess. M divided by that inflation is the size of an independent sample as good for
         estimating the mean.
-
-        Args:
-            samples: (S M D), samples of the belief before the answer.
-            ess: (S), their effective sample size.
-            answers: (S H), what ``response_model.evidence`` makes of all answers. The last is the
-                one to condition on; of the others, those that are -1 count for nothing.
-            generator: the source of all randomness, on the device of the samples.
-
-        Raises:
-            InputError: a sample or a feature is not finite.
         """
         check_finite("samples or features of the answers", samples, answers.rows)
         size = max(1, MOVED // (self.n_samples * self._moves_for(samples.shape[-1])))

@@ -10,20 +10,28 @@ from typing import Any
 from torch import Tensor
 
 from torchrl_pref.checkpoints.contents import check_content
+from torchrl_pref.checkpoints.migrations import MIGRATIONS, migrate
 from torchrl_pref.errors import InputError
+from torchrl_pref.policies import POLICIES
 from torchrl_pref.pool import Normalizer, QueryPool, save_atomically
 from torchrl_pref.runs import CHECKPOINT
 from torchrl_pref.storage.files import load_safely
 
 KIND = "torchrl_pref checkpoint"
 
-FORMAT = 4
+FORMAT = 5
 """Raised whenever a key of the settings or of the checkpoint changes its meaning or its name."""
 
 
 def picks_by_index(settings: dict[str, Any]) -> bool:
     """Whether a policy of these settings picks an index of its training pool."""
-    return bool(settings["policy"]["name"] == "paper" and settings["setup"]["name"] == "query")
+    return "N" in bound_to(settings)
+
+
+def bound_to(settings: dict[str, Any]) -> str:
+    """Which of N, K and D may not change for a policy of these settings."""
+    kind = POLICIES.get(settings["policy"]["name"])
+    return "" if kind is None else str(getattr(kind, settings["setup"]["name"]))
 
 
 @dataclass
@@ -76,11 +84,13 @@ class Checkpoint:
         content.pop("kind")
         found = content.pop("format", None)
         version = found if type(found) is int and 0 <= found < 1000 else "unknown"
-        if version != FORMAT or set(content) != set(cls.__dataclass_fields__):
+        known = version == FORMAT or version in MIGRATIONS
+        if not known or set(content) != set(cls.__dataclass_fields__):
             raise InputError(
                 f"{path}: written by another version of this package (format {version}, expected "
                 f"{FORMAT}); train again, or use the version that wrote it"
             )
+        content = migrate(content, int(version))
         try:
             check_content(content)
         except InputError as error:
@@ -101,11 +111,7 @@ class Checkpoint:
         """
         expected = dict(self.pool_shape)
         found = {"N": len(pool), "K": pool.n_options, "D": pool.n_features}
-        policy = self.settings["policy"]["name"]
-        made_for = {"scorer": "", "attention": "D"}.get(
-            policy, "NKD" if self.picks_by_index else "KD"
-        )
-        expected = {size: expected[size] for size in made_for}
+        expected = {size: expected[size] for size in bound_to(self.settings)}
         differs = [f"{k}={found[k]} (trained on {v})" for k, v in expected.items() if found[k] != v]
         if differs:
             raise InputError(

@@ -23,7 +23,6 @@ Types = tuple[type, ...]
 
 TOP: dict[str, Types] = {
     "tau": NUMBER + TEXT,
-    "tau_spread": NUMBER,
     "objective": TEXT,
     "skip": TEXT,
     "device": TEXT,
@@ -32,12 +31,15 @@ TOP: dict[str, Types] = {
 }
 
 SECTIONS: dict[str, dict[str, Types]] = {
-    "grid": {"size": WHOLE, "length": WHOLE},
+    "task": {"name": TEXT},
+    "question": {"name": TEXT},
+    "human": {"name": TEXT, "lapse": NUMBER},
     "pool": {
         **dict.fromkeys(("size", "options", "seed"), WHOLE),
         **dict.fromkeys(("train", "test"), TEXT + NONE),
     },
-    "belief": {"samples": WHOLE, "moves": WHOLE + NONE},
+    "belief": {"name": TEXT, "lapse": NUMBER},
+    "policy": {"name": TEXT, "sample": FLAG},
     "evaluation": {"humans": WHOLE, "seed": WHOLE},
     "training": {
         **dict.fromkeys(("updates", "sessions", "critic_steps", "warm_up", "save_every"), WHOLE),
@@ -51,12 +53,6 @@ SECTIONS: dict[str, dict[str, Types]] = {
 SETUPS: dict[str, dict[str, Types]] = {
     "query": {"budget": WHOLE, "candidates": WHOLE + NONE, "repeats": FLAG},
     "feed": {"budget": WHOLE, "offers": WHOLE + NONE, "on_skip": TEXT},
-}
-
-POLICIES: dict[str, dict[str, Types]] = {
-    "scorer": {"sample": FLAG, "start": TEXT + NONE},
-    "attention": {"sample": FLAG, "tokens": TEXT},
-    "paper": {"sample": FLAG},
 }
 
 CURVES = ("train/alignment", "train/episode_length", "train/reward")
@@ -114,7 +110,7 @@ def check_weights(name: str, weights: Any) -> None:
 
 def _check_settings(settings: Any) -> None:
     _expect(isinstance(settings, dict), "settings", "a dict")
-    named = {"setup": SETUPS, "policy": POLICIES}
+    named = {"setup": SETUPS}
     for section, known in named.items():
         value = settings.get(section)
         name = value.get("name") if isinstance(value, dict) else None

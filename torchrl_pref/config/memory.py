@@ -46,7 +46,7 @@ def check_memory(settings: dict[str, Any], *pool_shape: int) -> None:
 
     Args:
         settings: of a training or of an evaluation, each in its range.
-        pool_shape: N, K and D; by default those of the Gridworld pools that the settings ask for.
+        pool_shape: N, K and D; by default those that the settings ask for, with the Gridworld's D.
 
     Raises:
         InputError: the largest part of the run is estimated at more than there is.
@@ -63,14 +63,15 @@ def check_memory(settings: dict[str, Any], *pool_shape: int) -> None:
 
 def parts_of(settings: dict[str, Any], *pool_shape: int) -> Iterator[Part]:
     """What a run keeps in memory, estimated."""
-    pool, grid, setup = settings["pool"], settings["grid"], settings["setup"]
+    pool, task, setup = settings["pool"], settings["task"], settings["setup"]
     n_queries, n_options, n_features = pool_shape or (pool["size"], pool["options"], N_FEATURES)
-    of_gridworld = pool["train"] is None
-    sizes = ("pool.size", "pool.options") if of_gridworld else ()
-    if of_gridworld:
-        walks = 150.0 * pool["size"] * pool["options"] * grid["length"]
-        yield Part("the pools", walks, (*sizes, "grid.length"))
-    samples, budget, offers = settings["belief"]["samples"], setup["budget"], _offers(settings)
+    of_task = pool["train"] is None
+    sizes = ("pool.size", "pool.options") if of_task else ()
+    if of_task:
+        walks = 150.0 * pool["size"] * pool["options"] * task.get("length", 1)
+        yield Part("the pools", walks, (*sizes, "task.length"))
+    samples = settings["belief"].get("samples", 100)
+    budget, offers = setup["budget"], _offers(settings)
     beliefs = ("belief.samples", "setup.budget")
     if "training" in settings:
         steps = settings["training"]["steps"] or offers or budget
@@ -117,8 +118,8 @@ def _belief_parts(settings: dict[str, Any], n_options: int, n_features: int) -> 
     belief, budget = settings["belief"], settings["setup"]["budget"]
     sessions = settings.get("training", {}).get("sessions", 0)
     sessions = max(sessions, settings["evaluation"]["humans"])
-    samples = belief["samples"]
-    moves = belief["moves"] or default_moves(n_features)
+    samples = belief.get("samples", 100)
+    moves = belief.get("moves") or default_moves(n_features)
     at_once = max(samples, min(sessions * samples, MOVED // moves))
     directions = 4.0 * (UNIFORMS * moves + 4 * n_features) * at_once
     yield Part("moving the belief", directions, ("belief.samples", "belief.moves"))

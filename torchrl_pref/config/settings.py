@@ -41,22 +41,19 @@ Settings = dict[str, Any]
 OBJECTIVES = ("information_gain", "alignment", "true_alignment", "entropy")
 
 TASK: dict[str, Check] = {
-    "tau_spread": check_spread,
     "objective": choice(*OBJECTIVES),
     "skip": choice("regret", "free"),
     "device": check_device,
     "threads": count(1, LARGEST_THREADS),
-    "grid.size": count(2, 2**24),  # float32 counts cells no further
-    "grid.length": count(1),
     "pool.size": count(1),
     "pool.options": count(2),
     "pool.seed": count(0, 2**29 - 1),  # a pool takes two seeds below 2**31, and there are two
     "pool.train": optional(check_path),
     "pool.test": optional(check_path),
-    "belief.samples": count(2),
-    "belief.moves": optional(count(1)),
     "evaluation.humans": count(2),
     "evaluation.seed": check_seed,
+    "human.lapse": check_share,
+    "belief.lapse": check_share,
 }
 """Of both scripts."""
 
@@ -112,10 +109,23 @@ POLICIES: dict[str, dict[str, Check]] = {
     },
     "paper": {"policy.sample": check_flag},
 }
+OTHERS: dict[str, dict[str, dict[str, Check]]] = {
+    "task": {
+        "gridworld": {
+            "task.size": count(2, 2**24),  # float32 counts cells no further
+            "task.length": count(1),
+        }
+    },
+    "question": {"choice": {}},
+    "human": {"simulated": {"human.spread": check_spread}},
+    "belief": {"sampled": {"belief.samples": count(2), "belief.moves": optional(count(1))}},
+}
+"""Of the other groups. What is not in here is checked by what is made of it: ``open_groups``."""
+
 PRETRAINED: dict[str, dict[str, Check]] = {"pretrained": {}}
 """The policies that evaluate.py can be asked for by name."""
 
-SECTIONS = ("grid", "pool", "belief", "evaluation", "training", "setup", "policy")
+SECTIONS = ("pool", "evaluation", "training", "setup", "policy", *OTHERS)
 
 
 def check_train_settings(settings: Settings) -> None:
@@ -170,10 +180,12 @@ def _check_keys(
                 f"type {section}.<key>=<value>, --help lists them"
             )
     checks = dict(table)
-    for group, tables in (("setup", SETUPS), ("policy", policies)):
-        if tables:
-            checks |= _group_checks(settings, group, tables)
+    groups = {"setup": SETUPS, **OTHERS, **({"policy": policies} if policies else {})}
+    for group, tables in groups.items():
+        checks |= _group_checks(settings, group, tables)
     given = _flat(settings)
+    free = tuple(f"{group}." for group in open_groups(settings))
+    checks |= {key: _anything for key in given if key.startswith(free) and key not in checks}
     for key in given:
         if key not in checks:
             raise InputError(
@@ -189,13 +201,30 @@ def _check_keys(
 def _group_checks(
     settings: Settings, group: str, tables: Mapping[str, Mapping[str, Check]]
 ) -> dict[str, Check]:
-    """The checks of the setup or of the policy that is chosen."""
+    """The checks of what a group chooses."""
     options = " or ".join(f"{group}={name}" for name in tables)
     if "name" not in settings.get(group, {}):
         raise InputError(f"{group} is missing: expected one; type {options}")
     name = settings[group]["name"]
+    if group in open_groups(settings):
+        return {f"{group}.name": _anything}
     check_choice(group, name, tuple(tables))
     return {f"{group}.name": choice(name), **tables[name]}
+
+
+def open_groups(settings: Settings) -> list[str]:
+    """The groups whose settings are checked by what is made of them, and not by a table here."""
+    known = {**OTHERS, "policy": {**POLICIES, **PRETRAINED}}
+    chosen = {group: settings.get(group, {}).get("name") for group in known}
+    return [
+        group
+        for group, name in chosen.items()
+        if name == "own" or (group in OTHERS and isinstance(name, str) and name not in known[group])
+    ]
+
+
+def _anything(name: str, value: Any) -> None:
+    """What is checked elsewhere."""
 
 
 def _flat(settings: Settings) -> dict[str, Any]:
@@ -221,7 +250,7 @@ def _check_together(settings: Settings) -> None:
     given = [name for name in ("train", "test") if pool[name] is not None]
     if len(given) == 1 and settings.get("checkpoint") is None:
         raise InputError(
-            f"pool.{given[0]}={pool[given[0]]} alone: the other pool would be the Gridworld's; "
+            f"pool.{given[0]}={pool[given[0]]} alone: the other pool would be the task's; "
             "expected both pool.train and pool.test of your own, or neither"
         )
     budget = setup["budget"]

@@ -9,10 +9,10 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from torchrl_pref.beliefs.sampled import Belief
+from torchrl_pref.beliefs.base import BeliefBase
 from torchrl_pref.envs.session import SessionEnv, State
 from torchrl_pref.errors import check_choice, check_count
-from torchrl_pref.humans.simulated import SimulatedHuman
+from torchrl_pref.humans.base import HumanBase
 from torchrl_pref.pool import QueryPool
 
 
@@ -57,8 +57,8 @@ class FeedEnv(SessionEnv):
     def __init__(
         self,
         pool: QueryPool,
-        human: SimulatedHuman,
-        belief: Belief,
+        human: HumanBase,
+        belief: BeliefBase,
         budget: int = 20,
         offers: int | None = None,
         on_skip: str = "new",

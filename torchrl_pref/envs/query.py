@@ -9,10 +9,10 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from torchrl_pref.beliefs.sampled import Belief
+from torchrl_pref.beliefs.base import BeliefBase
 from torchrl_pref.envs.session import SessionEnv, State
 from torchrl_pref.errors import InputError, check_count, check_flag
-from torchrl_pref.humans.simulated import SimulatedHuman
+from torchrl_pref.humans.base import HumanBase
 from torchrl_pref.pool import QueryPool
 
 
@@ -46,8 +46,8 @@ class QueryEnv(SessionEnv):
     def __init__(
         self,
         pool: QueryPool,
-        human: SimulatedHuman,
-        belief: Belief,
+        human: HumanBase,
+        belief: BeliefBase,
         budget: int = 20,
         candidates: int | None = None,
         repeats: bool = True,

@@ -41,11 +41,11 @@ from torchrl.envs import EnvBase
 
 from torchrl_pref.acquisition.functions import information_gain
 from torchrl_pref.acquisition.scoring import score_queries
-from torchrl_pref.beliefs.sampled import Belief
+from torchrl_pref.beliefs.base import BeliefBase
 from torchrl_pref.envs.objectives import make_objective
 from torchrl_pref.envs.state import check_state
 from torchrl_pref.errors import InputError, check_count, check_type
-from torchrl_pref.humans.simulated import SimulatedHuman
+from torchrl_pref.humans.base import HumanBase
 from torchrl_pref.pool import QueryPool
 from torchrl_pref.questions.base import check_same
 from torchrl_pref.tensors import check_range, check_shape
@@ -67,8 +67,8 @@ class SessionEnv(EnvBase):
     def __init__(
         self,
         pool: QueryPool,
-        human: SimulatedHuman,
-        belief: Belief,
+        human: HumanBase,
+        belief: BeliefBase,
         budget: int,
         objective: str,
         batch_size: tuple[int, ...],
@@ -79,8 +79,8 @@ class SessionEnv(EnvBase):
             raise InputError(f"batch_size={batch_size}: expected one size, such as (64,)")
         check_count("batch_size", batch_size[0], 1)
         check_type("pool", pool, QueryPool, "QueryPool(features)")
-        check_type("human", human, SimulatedHuman, "SimulatedHuman(Boltzmann(2.0))")
-        check_type("belief", belief, Belief, "Belief(Boltzmann(2.0))")
+        check_type("human", human, HumanBase, "SimulatedHuman(Boltzmann(2.0))")
+        check_type("belief", belief, BeliefBase, "Belief(Boltzmann(2.0))")
         check_same(human.response_model.question, belief.response_model.question)
         check_count("seed", seed, 0)
         super().__init__(device=device, batch_size=torch.Size(batch_size))

@@ -168,7 +168,8 @@ def group_checkpoints(
                 ("the training pool", checkpoint.train_digest, first.train_digest),
                 ("budget", *(c.settings["setup"]["budget"] for c in (checkpoint, first))),
                 ("belief", *(c.settings["belief"] for c in (checkpoint, first))),
-                ("tau_spread", *(c.settings["tau_spread"] for c in (checkpoint, first))),
+                ("human", *(c.settings["human"] for c in (checkpoint, first))),
+                ("question", *(c.settings["question"] for c in (checkpoint, first))),
                 ("skip", _skip_of(checkpoint), next(filter(None, map(_skip_of, all_of)), None)),
                 ("feed", _feed_of(checkpoint), next(filter(None, map(_feed_of, all_of)), None)),
             ):

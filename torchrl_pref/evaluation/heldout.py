@@ -27,6 +27,7 @@ from torchrl_pref.acquisition.functions import alignment_gain, information_gain,
 from torchrl_pref.build import (
     Settings,
     Task,
+    draw_pool,
     load_policy,
     make_feed_env,
     make_pools,
@@ -49,7 +50,6 @@ from torchrl_pref.strategies import (
     RandomQuery,
     ThresholdAsk,
 )
-from torchrl_pref.tasks.gridworld import gridworld_pool
 
 POOLS, BALANCED_POOLS, HUMANS = 10, 3, 100
 
@@ -171,7 +171,7 @@ def _start_worker() -> None:
 
 def _check_fits(settings: Settings, cell: Cell, checkpoint: Checkpoint, first: Checkpoint) -> None:
     """Refuse a policy that cannot be run on other pools, or is no training seed of the first."""
-    for key in ("policy", "objective", "skip", "setup", "belief", "training", "tau_spread", "pool"):
+    for key in SAME:
         mine, theirs = checkpoint.settings[key], first.settings[key]
         if mine != theirs:
             raise InputError(
@@ -195,13 +195,11 @@ def _task_and_pool(job: Job) -> tuple[Task, QueryPool]:
     """The task, with tau solved on the training pool, and the job's own test pool."""
     settings = job.settings
     train, _ = make_pools(settings)
-    grid, pool = settings["grid"], settings["pool"]
     # A pool takes two seeds.
-    seed = FIRST_SEED + 2 * job.pool
-    test = gridworld_pool(pool["size"], pool["options"], grid["size"], grid["length"], seed)
+    test = draw_pool(settings, FIRST_SEED + 2 * job.pool)
     if job.cell.features == "balanced":
         train, test = (each.map_features(balance(train.features)) for each in (train, test))
-    task = make_task(train, test, job.cell.tau)
+    task = make_task(train, test, job.cell.tau, settings)
     return task, task.test
 
 
@@ -232,6 +230,11 @@ class Chorus(TensorDictModuleBase):
             self.seconds[number] += time.perf_counter() - start
         return tensordict.set("action", torch.cat(actions))
 
+
+SAME = (
+    *("policy", "objective", "skip", "setup", "belief", "training", "human", "question", "pool"),
+)
+"""What the trainings of one row have in common."""
 
 MakeEnv = Callable[[int], QueryEnv | FeedEnv]
 """From a number of sessions to an environment for as many."""

@@ -13,11 +13,12 @@ from torch import Generator, Tensor
 
 from torchrl_pref.beliefs.sampled import uniform_sphere
 from torchrl_pref.errors import InputError, check_positive, check_type
+from torchrl_pref.humans.base import HumanBase
 from torchrl_pref.questions.responses import ResponseModel
 from torchrl_pref.tensors import check_finite
 
 
-class SimulatedHuman:
+class SimulatedHuman(HumanBase):
     """A human with hidden weights ω, uniform on the unit sphere, who answers by a response model.
 
     All the randomness of the answers is drawn with ω, one draw for each of the H answers to come:
@@ -36,11 +37,10 @@ class SimulatedHuman:
     def __init__(self, response_model: ResponseModel, spread: float = 1.0) -> None:
         check_type("response_model", response_model, ResponseModel, "Boltzmann(2.0)")
         self.response_model = response_model
-        self.spread = check_positive("tau_spread", spread)
+        self.spread = check_positive("spread", spread)
         if not 1 <= spread <= 1e6:
             raise InputError(
-                f"tau_spread={spread}: expected a factor of at least 1, and at most 1e6; 1 is no "
-                "spread"
+                f"spread={spread}: expected a factor of at least 1, and at most 1e6; 1 is no spread"
             )
 
     def draw(
@@ -58,19 +58,7 @@ class SimulatedHuman:
     def respond(
         self, queries: Tensor, human: TensorDictBase | Mapping[str, Tensor], turn: Tensor
     ) -> Tensor:
-        """Answer a query, by the Gumbel-max trick.
-
-        Args:
-            queries: (B K D), features of the options.
-            human: as drawn.
-            turn: (B), how many queries each human has answered before.
-
-        Returns:
-            (B) int64, the index of the answer.
-
-        Raises:
-            InputError: the returns are not finite.
-        """
+        """See :meth:`HumanBase.respond`; by the Gumbel-max trick."""
         returns = (queries @ human["omega"].unsqueeze(-1)).squeeze(-1) * human["care"]
         check_finite("the human's returns (queries @ omega * care)", returns)
         noise = torch.take_along_dim(human["noise"], turn[:, None, None], 1).squeeze(1)

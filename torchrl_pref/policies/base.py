@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -53,6 +53,18 @@ class Policy:
     def weights(self) -> nn.ModuleDict:
         """All that is learned, to be saved and loaded by its ``state_dict``."""
         return nn.ModuleDict({"actor": self.actor, "critic": self.critic})
+
+
+class PolicyKind(NamedTuple):
+    """A way to make policies, and the sizes of a pool that a trained one is bound to."""
+
+    make: Callable[..., Policy]
+    """From an environment, and settings of its own, to an untrained policy."""
+    query: str = ""
+    """Which of N, K and D may not change where it chooses from candidates. One that is bound to N
+    picks an index of its training pool, which means nothing on another."""
+    feed: str = ""
+    """The same where it decides on offers."""
 
 
 class Layer(TensorDictModuleBase):

@@ -16,6 +16,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_pref.errors import check_count
 from torchrl_pref.pool import QueryPool
+from torchrl_pref.tasks.base import Task, make_pool
 
 MOVES = ((-1, 0), (1, 0), (0, -1), (0, 1))
 """Change of (row, column) for each of the four actions: up, down, left, right."""
@@ -47,8 +48,8 @@ class Gridworld(EnvBase):
         device: torch.device | str = "cpu",
     ) -> None:
         super().__init__(device=device, batch_size=torch.Size(batch_size))
-        self.size = check_count("grid.size", size, 2)
-        self.length = check_count("grid.length", length, 1)
+        self.size = check_count("size", size, 2)
+        self.length = check_count("length", length, 1)
         self.register_buffer("moves", torch.tensor(MOVES, device=device))
         self._set_seed(seed)
         batch = self.batch_size
@@ -134,6 +135,32 @@ def corner_distances(positions: Tensor, size: int) -> Tensor:
     return offsets.norm(dim=-1).mean(-2)
 
 
+class GridworldTask(Task):
+    """The paper's: random walks on a grid, and their mean distances to its corners (section 4.1).
+
+    Args:
+        size: cells along an edge, at least 2.
+        length: T, cells in a walk, at least 1.
+
+    Raises:
+        InputError: a number is below its minimum.
+    """
+
+    feature_names = ("top left", "top right", "bottom left", "bottom right")
+
+    def __init__(self, size: int = 8, length: int = 20) -> None:
+        self.size = check_count("size", size, 2)
+        self.length = check_count("length", length, 1)
+
+    def trajectories(self, count: int, seed: int) -> Tensor:
+        """See :meth:`Task.trajectories`: (count T 2) int64, cells."""
+        return random_walks(count, self.size, self.length, seed)
+
+    def features(self, trajectories: Tensor) -> Tensor:
+        """See :meth:`Task.features`: (… 4), mean distances in cells."""
+        return corner_distances(trajectories, self.size)
+
+
 def gridworld_pool(
     n_queries: int = 1000, n_options: int = 2, size: int = 8, length: int = 20, seed: int = 0
 ) -> QueryPool:
@@ -149,9 +176,4 @@ def gridworld_pool(
     Raises:
         InputError: a number is below its minimum.
     """
-    check_count("pool.size", n_queries, 1)
-    check_count("pool.options", n_options, 2)
-    walks = random_walks(n_queries * n_options, size, length, seed)
-    features = corner_distances(walks, size)
-    shape = (n_queries, n_options)
-    return QueryPool(features.unflatten(0, shape), walks.unflatten(0, shape))
+    return make_pool(GridworldTask(size, length), n_queries, n_options, seed)

@@ -1,0 +1,57 @@
+"""What everybody who answers keeps to: the package's humans, and one written outside of it."""
+
+from collections.abc import Callable
+
+import my_human
+import pytest
+import torch
+from torch import Generator
+
+from torchrl_pref.humans import HUMANS
+from torchrl_pref.humans.base import HumanBase
+from torchrl_pref.questions.responses import Boltzmann, Optimal, ResponseModel
+from torchrl_pref.questions.weak import Weak
+
+MAKE = [*HUMANS.values(), my_human.Tiring]
+MODELS = [Boltzmann(4.0), Optimal(), Boltzmann(4.0, Weak(0.3), lapse=0.1)]
+
+
+@pytest.mark.parametrize("model", MODELS, ids=str)
+@pytest.mark.parametrize("make", MAKE)
+def test_answers(
+    make: Callable[[ResponseModel], HumanBase], model: ResponseModel, generator: Generator
+) -> None:
+    human, n_answers = make(model), model.n_answers(2)
+    drawn = human.draw(500, 3, n_answers, 4, generator)
+    assert drawn.batch_size == (500,)
+    assert torch.allclose(drawn["omega"].norm(dim=-1), torch.ones(500), atol=1e-5)
+    queries = torch.randn(500, 2, 4, generator=generator)
+    for turn in range(3):
+        answers = human.respond(queries, drawn, torch.full((500,), turn))
+        assert answers.dtype == torch.int64
+        assert ((answers >= 0) & (answers < n_answers)).all()
+        # All luck is drawn beforehand, and nobody's depends on who else is asked.
+        some = human.respond(queries[7:9], drawn[7:9], torch.full((2,), turn))
+        assert torch.equal(some, answers[7:9])
+        returns = (queries @ drawn["omega"].unsqueeze(-1)).squeeze(-1)
+        picked = answers < 2
+        assert (answers == returns.argmax(-1))[picked].float().mean() > 0.75
+
+
+@pytest.mark.parametrize("make", MAKE)
+def test_a_generator_fixes_them(make: Callable[[ResponseModel], HumanBase]) -> None:
+    human = make(MODELS[0])
+    first, again = (human.draw(9, 2, 2, 4, Generator().manual_seed(3)) for _ in range(2))
+    assert (first == again).all()
+
+
+def test_who_tires_errs_more_and_more(generator: Generator) -> None:
+    human = my_human.Tiring(Optimal(), patience=5)
+    drawn = human.draw(4000, 20, 2, 4, generator)
+    queries = torch.randn(4000, 2, 4, generator=generator)
+    best = (queries @ drawn["omega"].unsqueeze(-1)).squeeze(-1).argmax(-1)
+    right = [
+        float((human.respond(queries, drawn, torch.full((4000,), t)) == best).float().mean())
+        for t in (0, 5, 19)
+    ]
+    assert right == pytest.approx([1.0, 0.75, 1 - 19 / 24 / 2], abs=0.04)

@@ -1,0 +1,84 @@
+"""Each file of examples/extending is short, and the main job runs with it from outside."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+FOLDER = ROOT / "examples" / "extending"
+
+SMALL = [
+    *("pool.size=40", "setup.budget=3", "evaluation.humans=6"),
+    *("training.updates=2", "training.sessions=6", "training.warm_up=1", "evaluation.during=0"),
+]
+
+JOBS = {
+    "task": ["task=my_task:Table", "task.steps=12"],
+    "question": ["question=my_question:Ranking", "pool.options=3"],
+    "belief": ["belief=my_belief:Weighted", "belief.draws=500"],
+    "human": ["human=my_human:Tiring", "human.patience=5"],
+    "policy": ["setup=query", "policy=my_policy:perceptron", "policy.width=8"],
+}
+
+
+def run(script: str, *arguments: str, folder: Path = FOLDER) -> subprocess.CompletedProcess[str]:
+    """A script as a user runs it from that folder."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, str(ROOT / script), *arguments]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, env=environment)
+
+
+@pytest.mark.parametrize("path", sorted(FOLDER.glob("*.py")), ids=lambda path: path.stem)
+def test_each_is_one_short_file(path: Path) -> None:
+    assert len(path.read_text().splitlines()) <= 60
+    assert path.stem in (ROOT / "docs" / "extending.md").read_text()
+
+
+@pytest.mark.parametrize("what", JOBS)
+def test_the_main_job_runs_with_it(what: str, tmp_path: Path) -> None:
+    done = run("train.py", *SMALL, *JOBS[what], f"hydra.run.dir={tmp_path / 'run'}")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "run" / "checkpoint.pt").exists()
+    assert "written to" in done.stdout
+
+
+def test_a_checkpoint_never_names_code_to_import(tmp_path: Path) -> None:
+    """What the run was made with is typed again, or is not imported."""
+    folder = tmp_path / "run"
+    assert run("train.py", *SMALL, *JOBS["policy"], f"hydra.run.dir={folder}").returncode == 0
+    longer = [f"resume={folder}", "training.updates=3"]
+    untyped = run("train.py", *longer)
+    assert untyped.returncode == 2
+    assert untyped.stderr.startswith("error: policy=my_policy:perceptron: a file names code")
+    other = run("train.py", *longer, "policy=my_policy:Scores")
+    assert "the run was made with policy=my_policy:perceptron" in other.stderr
+    typed = run("train.py", *longer, "policy=my_policy:perceptron")
+    assert typed.returncode == 0, typed.stderr
+
+
+@pytest.mark.parametrize(
+    ("typed", "words"),
+    [
+        ("task=my_task:Nothing", "task=my_task:Nothing: cannot be imported"),
+        ("task=nowhere:Table", "No module named 'nowhere'"),
+        ("task=my_task:torch", "task=my_task:torch: module; expected a class or a function"),
+        ("task=own", "task"),
+        ("human=my_human:Tiring human.patients=3", "unexpected keyword argument 'patients'"),
+        ("question=weak question.threshold=-1", "question.threshold=-1: expected a finite number"),
+        ("question=weak pool.options=3", "a weak question about 3 options: expected 2"),
+        ("question=weak tau=optimal", "tau=optimal with Weak"),
+        ("policy.width=3", "width"),
+    ],
+)
+def test_what_cannot_be_made_is_refused_before_there_is_a_folder(
+    typed: str, words: str, tmp_path: Path
+) -> None:
+    done = run("train.py", *typed.split(), f"hydra.run.dir={tmp_path / 'run'}")
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1
+    assert words in done.stderr
+    assert not (tmp_path / "run").exists()

@@ -1,0 +1,117 @@
+"""What a name in the settings stands for: the tables of the folders, and what the user brings.
+
+A *group* is a section of the settings that chooses one of several things by its ``name`` and holds
+that thing's own settings, which are the arguments of its constructor.
+"""
+
+from __future__ import annotations
+
+import inspect
+import os
+import sys
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from typing import Any
+
+from torchrl_pref.beliefs import BELIEFS
+from torchrl_pref.errors import InputError, check_choice
+from torchrl_pref.humans import HUMANS
+from torchrl_pref.policies import POLICIES
+from torchrl_pref.questions import QUESTIONS
+from torchrl_pref.tasks import TASKS
+
+TABLES: dict[str, Mapping[str, Callable[..., Any]]] = {
+    "task": TASKS,
+    "question": QUESTIONS,
+    "human": HUMANS,
+    "belief": BELIEFS,
+    "policy": {name: kind.make for name, kind in POLICIES.items()},
+}
+"""What there is to choose from, by group."""
+
+OWN = "own"
+"""The name in any group of what the user brings, by ``make``: ``module:name``."""
+
+_typed: set[str] = set()
+
+
+def allow(reference: str) -> None:
+    """From now on, in this process, ``module:name`` may be imported: the user typed it.
+
+    What a checkpoint names is never imported unless the user types it again.
+    """
+    _typed.add(reference)
+
+
+def make(group: str, section: Mapping[str, Any], *given: Any, without: tuple[str, ...] = ()) -> Any:
+    """The thing that a section chooses, made with its settings.
+
+    Args:
+        group: a key of ``TABLES``.
+        section: its settings.
+        given: what is handed to the constructor before them.
+        without: settings that the constructor does not take.
+
+    Raises:
+        InputError: there is no such thing, or it cannot be made with these settings.
+    """
+    constructor = find(group, section)
+    left_out = {"name", "make", *without} if section["name"] == OWN else {"name", *without}
+    keys = {key: value for key, value in section.items() if key not in left_out}
+    try:
+        inspect.signature(constructor).bind(*given, **keys)
+    except TypeError as error:
+        raise InputError(
+            f"{group}={section['name']} with {', '.join(keys) or 'no settings'}: {error}; expected "
+            f"those of {constructor.__name__}{inspect.signature(constructor)}"
+        ) from None
+    try:
+        return constructor(*given, **keys)
+    except InputError as error:
+        first = str(error).partition("=")[0]
+        raise InputError(f"{group}.{error}" if first in keys else str(error)) from None
+
+
+def find(group: str, section: Mapping[str, Any]) -> Callable[..., Any]:
+    """The class or function that a section chooses.
+
+    Raises:
+        InputError: there is none.
+    """
+    if section["name"] != OWN:
+        table = TABLES[group]
+        return table[check_choice(group, section["name"], tuple(table))]
+    reference = section.get("make")
+    if not isinstance(reference, str) or reference.count(":") != 1:
+        raise InputError(f"{group}={reference!r}: expected <module>:<name>")
+    if reference not in _typed:
+        raise InputError(
+            f"{group}={reference}: a file names code of yours, which is run only if you type it; "
+            f"add {group}={reference} to the command"
+        )
+    return load(f"{group}={reference}", reference)
+
+
+def load(what: str, reference: str) -> Callable[..., Any]:
+    """Import ``module:name``, where the present folder is looked in too.
+
+    Args:
+        what: was typed, for messages.
+        reference: ``module:name``.
+
+    Raises:
+        InputError: there is no such module or name, or what it names cannot be called.
+    """
+    module, _, name = reference.partition(":")
+    if os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())
+    try:
+        found = getattr(import_module(module), name)
+    except (ImportError, AttributeError, SyntaxError, ValueError) as error:
+        raise InputError(
+            f"{what}: cannot be imported ({type(error).__name__}: {error}); expected a module in "
+            "this folder or installed, and the name of a class or function in it"
+        ) from None
+    if not callable(found):
+        raise InputError(f"{what}: {type(found).__name__}; expected a class or a function")
+    return found

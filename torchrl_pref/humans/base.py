@@ -1,0 +1,54 @@
+"""What everybody who is asked can do.
+
+Shapes: B sessions, H query budget, K options per query, R possible answers, D features.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+
+from tensordict import TensorDict, TensorDictBase
+from torch import Generator, Tensor
+
+from torchrl_pref.questions.responses import ResponseModel
+
+
+class HumanBase(ABC):
+    """Someone who answers queries.
+
+    Attributes:
+        response_model: the kind of question that they answer, and how; what a belief assumes may
+            differ.
+    """
+
+    response_model: ResponseModel
+
+    @abstractmethod
+    def draw(
+        self, n_sessions: int, budget: int, n_answers: int, n_features: int, generator: Generator
+    ) -> TensorDict:
+        """Draw B humans, with all the luck of their H answers.
+
+        Returns:
+            ``omega`` (B D), their weights, and whatever else :meth:`respond` reads: every tensor
+            (B …) and none that changes during a session.
+        """
+
+    @abstractmethod
+    def respond(
+        self, queries: Tensor, human: TensorDictBase | Mapping[str, Tensor], turn: Tensor
+    ) -> Tensor:
+        """Answer a query.
+
+        Args:
+            queries: (B K D), features of the options.
+            human: as drawn.
+            turn: (B), how many queries each human has answered before.
+
+        Returns:
+            (B) int64, the index of the answer.
+
+        Raises:
+            InputError: the returns are not finite.
+        """

@@ -1,0 +1,51 @@
+"""Tasks: where trajectories come from, and what of them a person's reward may depend on.
+
+Shapes: N queries, K options per query, T trajectory length, D features.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+from torch import Tensor
+
+from torchrl_pref.errors import check_count
+from torchrl_pref.pool import QueryPool
+
+
+class Task(ABC):
+    """A kind of trajectory, and its features.
+
+    Attributes:
+        feature_names: D, what each feature is called.
+    """
+
+    feature_names: tuple[str, ...]
+
+    @abstractmethod
+    def trajectories(self, count: int, seed: int) -> Tensor:
+        """Trajectories (count T …) that a seed fixes; it may use ``seed`` and ``seed + 1``."""
+
+    @abstractmethod
+    def features(self, trajectories: Tensor) -> Tensor:
+        """Features (… D) of trajectories (… T …), not normalised."""
+
+
+def make_pool(task: Task, n_queries: int, n_options: int, seed: int) -> QueryPool:
+    """Queries about a task: K trajectories each, with their features, not normalised.
+
+    Args:
+        task: where trajectories come from.
+        n_queries: N, at least 1.
+        n_options: K, at least 2.
+        seed: fixes the pool.
+
+    Raises:
+        InputError: a number is below its minimum, or the features cannot be used.
+    """
+    check_count("pool.size", n_queries, 1)
+    check_count("pool.options", n_options, 2)
+    trajectories = task.trajectories(n_queries * n_options, seed)
+    features = task.features(trajectories)
+    shape = (n_queries, n_options)
+    return QueryPool(features.unflatten(0, shape), trajectories.unflatten(0, shape))

@@ -31,7 +31,7 @@ def make(
     **options: object,
 ) -> QueryEnv | FeedEnv:
     belief = Belief(model, samples=20, moves=2)
-    options = {"budget": 5, "batch_size": (batch,), **options}
+    options = {"budget": 5, "batch_size": (batch,), "seed": 0, **options}
     return kind(pool, SimulatedHuman(model), belief, **options)  # type: ignore[arg-type]
 
 
@@ -42,7 +42,7 @@ def coin(env: QueryEnv | FeedEnv, seed: int = 0) -> TensorDictModule:
 def session_of(env: QueryEnv | FeedEnv) -> TensorDictBase:
     """A session after one answer."""
     ask = RandomQuery() if isinstance(env, QueryEnv) else RandomAsk()
-    return env.rollout(1, ask)[:, -1]["next"].exclude("reward")
+    return env.step_mdp(env.step(ask(env.reset())))
 
 
 def settings_of(setup: str = "feed", policy: str = "scorer", **training: Any) -> dict[str, Any]:

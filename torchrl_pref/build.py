@@ -12,12 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torchrl.envs import EnvBase
 
 from torchrl_pref.beliefs.sampled import Belief, uniform_sphere
 from torchrl_pref.checkpoints.checkpoint import Checkpoint, picks_by_index
 from torchrl_pref.checkpoints.restore import restore_weights
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
+from torchrl_pref.envs.session import is_feed
 from torchrl_pref.errors import InputError, check_choice, check_positive, check_seed
 from torchrl_pref.humans.simulated import SimulatedHuman
 from torchrl_pref.policies.attention import attention_policy
@@ -203,7 +205,7 @@ def _session_arguments(settings: Settings, task: Task, sessions: int, seed: int)
     }
 
 
-def make_policy(settings: Settings, env: QueryEnv | FeedEnv) -> Policy:
+def make_policy(settings: Settings, env: EnvBase) -> Policy:
     """The policy of the setting ``policy``, untrained, to fit an environment."""
     chosen = settings["policy"]
     name = check_choice("policy", chosen["name"], ("scorer", "attention", "paper"))
@@ -212,7 +214,7 @@ def make_policy(settings: Settings, env: QueryEnv | FeedEnv) -> Policy:
     if name == "paper":
         return paper_policy(env)
     start = chosen["start"]
-    if start is None and isinstance(env, QueryEnv):
+    if start is None and not is_feed(env):
         start = settings["objective"]  # as trained, whatever the environment's own is
     return scorer_policy(env, start)
 
@@ -246,7 +248,7 @@ def load_weights(policy: Policy, checkpoint: Checkpoint) -> None:
     restore_weights(policy.weights, checkpoint.weights)
 
 
-def load_policy(checkpoint: Checkpoint, env: QueryEnv | FeedEnv) -> Policy:
+def load_policy(checkpoint: Checkpoint, env: EnvBase) -> Policy:
     """A trained policy, to fit an environment.
 
     Raises:

@@ -14,11 +14,11 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Generator, Tensor
+from torchrl.envs import EnvBase
 
 from torchrl_pref.acquisition.functions import Acquisition, information_gain
 from torchrl_pref.acquisition.scoring import moments_among, predict_answers, score_queries, together
 from torchrl_pref.beliefs.per_belief import PerBelief
-from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.transition import OPEN
 from torchrl_pref.errors import check_count, check_share
 from torchrl_pref.questions.responses import ResponseModel
@@ -162,7 +162,7 @@ class ThresholdAsk(TensorDictModuleBase):
     out_keys = ["action"]
 
     def __init__(
-        self, env: FeedEnv, threshold: float, acquisition: Acquisition = information_gain
+        self, env: EnvBase, threshold: float, acquisition: Acquisition = information_gain
     ) -> None:
         super().__init__()
         self.response_model, self.acquisition = env.belief.response_model, acquisition
@@ -192,7 +192,7 @@ class QuantileAsk(TensorDictModuleBase):
 
     def __init__(
         self,
-        env: FeedEnv,
+        env: EnvBase,
         acquisition: Acquisition = information_gain,
         late: Acquisition | None = None,
     ) -> None:
@@ -223,7 +223,7 @@ class OfferRank:
     """
 
     def __init__(
-        self, env: FeedEnv, acquisition: Acquisition, late: Acquisition | None = None
+        self, env: EnvBase, acquisition: Acquisition, late: Acquisition | None = None
     ) -> None:
         self.response_model = env.belief.response_model
         both = (acquisition,) if late is None else (acquisition, late)

@@ -8,8 +8,10 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.data import Composite
 
 from torchrl_pref.beliefs.sampled import Belief
+from torchrl_pref.envs.allowed import AllowedActions, Table
 from torchrl_pref.envs.session import SessionEnv
 from torchrl_pref.envs.transition import Session, Tree
 from torchrl_pref.errors import InputError, check_count, check_flag
@@ -66,6 +68,7 @@ class QueryEnv(SessionEnv):
                 ": expected at least as many candidates as asks; raise one or lower the other"
             )
         self.repeats = check_flag("setup.repeats", repeats)
+        self._table = Table()
         self._make_specs(self.n_candidates)
 
     def _draw_questions(self, size: int) -> dict[str, Tensor]:
@@ -74,6 +77,18 @@ class QueryEnv(SessionEnv):
         shape = (size, len(self.features))
         keys = torch.rand(shape, generator=self.generator, device=self.device)
         return {"candidates": keys.topk(self.n_candidates, dim=-1).indices}
+
+    def _choice_of(self, n_actions: int) -> Composite:
+        inner = super()._choice_of(n_actions)
+        if self.repeats:
+            return inner
+        spec = AllowedActions(action=inner["action"], shape=self.batch_size, device=self.device)
+        spec.table = self._table
+        return spec
+
+    def _put_on_table(self, shown: dict[str, Tensor], begun: Tensor | None) -> None:
+        if not self.repeats:
+            self._table.show(shown["action_mask"], begun)
 
     @property
     def _shows_all(self) -> bool:

@@ -55,6 +55,11 @@ from torchrl_pref.pool import QueryPool
 from torchrl_pref.tensors import check_range, check_shape
 
 
+def is_feed(env: EnvBase) -> bool:
+    """Whether an environment, transformed or not, offers queries; if not, it shows candidates."""
+    return "offer" in env.observation_spec.keys()  # noqa: SIM118, a spec is no dictionary
+
+
 class SessionEnv(EnvBase):
     """What the environments share: a human, a belief, and what an answer does to it."""
 
@@ -98,7 +103,7 @@ class SessionEnv(EnvBase):
         kept = {"session": session}
         self.state_spec = _spec_of(TensorDict({**hidden, **kept}, batch, device=device))
         self.observation_spec = _spec_of(TensorDict({**shown, **kept}, batch, device=device))
-        self.action_spec = Categorical(n_actions, shape=batch, device=device)
+        self.action_spec = self._choice_of(n_actions)
         self.reward_spec = Unbounded(shape=(*batch, 1), device=device)
         flag = Binary(n=1, shape=(*batch, 1), dtype=torch.bool, device=device)
         self.done_spec = Composite(
@@ -106,6 +111,12 @@ class SessionEnv(EnvBase):
         )
         self._hidden_keys = tuple(hidden)
         self._remembered = hidden
+
+    def _choice_of(self, n_actions: int) -> Composite:
+        """The spec of an action."""
+        batch, device = self.batch_size, self.device
+        action = Categorical(n_actions, shape=batch, device=device)
+        return Composite(action=action, shape=batch, device=device)
 
     def _set_seed(self, seed: int | None) -> None:
         """Without a seed humans are new ones each time, in whatever process."""
@@ -139,8 +150,11 @@ class SessionEnv(EnvBase):
             session["mean"] = session["samples"].mean(1)
         mask = None if tensordict is None else tensordict.get("_reset", None)
         self._remember(hidden, mask)
-        root = {**hidden, "session": session, **self._shown(session, hidden)}
-        return TensorDict(root, self.batch_size, device=self.device)
+        shown = self._shown(session, hidden)
+        self._put_on_table(shown, mask)
+        return TensorDict(
+            {**hidden, "session": session, **shown}, self.batch_size, device=self.device
+        )
 
     def _fresh(self) -> tuple[Tree, Session]:
         """New humans who have answered nothing. The draws that strategies share come first."""
@@ -170,6 +184,9 @@ class SessionEnv(EnvBase):
             "n_asked": n_asked.clone(),
             "remaining": 1 - n_asked / self.budget,
         }
+
+    def _put_on_table(self, shown: dict[str, Tensor], begun: Tensor | None) -> None:
+        """Tell random actions what is shown now, in all sessions or where they began (B 1)."""
 
     def _session_of(self, tensordict: TensorDictBase) -> tuple[Tree, Session]:
         """What is hidden and what is kept of the sessions in a tensordict."""
@@ -244,7 +261,9 @@ class SessionEnv(EnvBase):
         """The next state with its reward and done flags; what is hidden stays where it is."""
         flags = {"terminated": terminated, "truncated": truncated & ~terminated}
         done = {"done": terminated | truncated, **flags, "reward": reward}
-        after = {"session": session, **self._shown(session, hidden), **done}
+        shown = self._shown(session, hidden)
+        self._put_on_table(shown, None)
+        after = {"session": session, **shown, **done}
         return TensorDict(after, self.batch_size, device=self.device)
 
     @abstractmethod

@@ -12,10 +12,10 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from torchrl_pref.envs.objectives import alignment, alignment_of_mean
-from torchrl_pref.envs.session import SessionEnv
 
 CURVES = ("alignment", "alignment_of_mean", "information", "ess")
 
@@ -50,13 +50,13 @@ class Evaluation:
     seconds_per_query: float
 
 
-def draw_humans(env: SessionEnv) -> TensorDict:
+def draw_humans(env: EnvBase) -> TensorDict:
     """Humans, their luck, prior samples and a feed's offers, for every strategy to start from."""
     return env.reset().select("human", ("session", "samples"), "offers", strict=False)
 
 
 def evaluate(
-    env: SessionEnv,
+    env: EnvBase,
     strategy: TensorDictModuleBase,
     humans: TensorDictBase,
     sample: bool = False,

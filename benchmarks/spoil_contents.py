@@ -136,6 +136,8 @@ def _steps(content: dict[str, Any]) -> dict[str, Any]:
 
 SESSIONS = ("training", "sessions")
 
+KEPT = (*SESSIONS, "session")
+
 EDITS: dict[str, Edit] = {
     "format 3": put("format", 3),
     "format 10^300": put("format", 10**300),
@@ -179,19 +181,17 @@ EDITS: dict[str, Edit] = {
     "optimizer without moments": lambda c: _steps(c).pop("exp_avg"),
     "optimizer with NaN": lambda c: _steps(c).update({"step": torch.tensor(math.nan)}),
     "optimizer with a text": lambda c: _steps(c).update({"step": "three"}),
-    "sessions: answers out of range": fill(2, *SESSIONS, "history", "answers"),
-    "sessions: queries out of range": fill(10**6, *SESSIONS, "history", "queries"),
-    "sessions: asked 10^6": fill(10**6, *SESSIONS, "n_asked"),
+    "sessions: answers out of range": fill(2, *KEPT, "history", "answers"),
+    "sessions: queries out of range": fill(10**6, *KEPT, "history", "index"),
+    "sessions: asked 10^6": fill(10**6, *KEPT, "n_asked"),
     "sessions: offers out of range": fill(-1, *SESSIONS, "offers"),
     "sessions: omega NaN": fill(math.nan, *SESSIONS, "human", "omega"),
-    "sessions: samples off the sphere": fill(9, *SESSIONS, "samples"),
-    "sessions: one human less": cut(*SESSIONS, "samples"),
+    "sessions: samples off the sphere": fill(9, *KEPT, "samples"),
+    "sessions: one human less": cut(*KEPT, "samples"),
     "sessions: no humans": lambda c: c["training"]["sessions"].pop("human"),
     "sessions: humans a text": put(*SESSIONS, "human", "someone"),
-    "sessions: samples complex": put(*SESSIONS, "samples", torch.ones(2, dtype=torch.complex64)),
-    "sessions: samples expanded": put(
-        *SESSIONS, "samples", torch.ones(1).expand(10**5, 10**5, 10**2)
-    ),
+    "sessions: samples complex": put(*KEPT, "samples", torch.ones(2, dtype=torch.complex64)),
+    "sessions: samples expanded": put(*KEPT, "samples", torch.ones(1).expand(10**5, 10**5, 10**2)),
     "random state cut": cut("training", "env_generator"),
     "random state of zeros": put("training", "global_generator", torch.zeros(5056).byte()),
     "random state of noise": put(

@@ -34,6 +34,7 @@ from omegaconf import OmegaConf
 from benchmarks import common
 from torchrl_pref.beliefs.sampled import Belief
 from torchrl_pref.envs.feed import FeedEnv
+from torchrl_pref.envs.objectives import alignment
 from torchrl_pref.humans.simulated import SimulatedHuman
 from torchrl_pref.policies.paper import paper_policy
 from torchrl_pref.questions.responses import Boltzmann
@@ -131,7 +132,8 @@ def check_twin() -> str:
     env, twin = make_env(HUMANS), make_twin()
     start = env.reset()
     steps = env.rollout(BUDGET, RandomAsk(), auto_reset=False, tensordict=start)["next"]
-    total = torch.cat([steps["metrics", "alignment"][:, -1], steps["reward"].sum(1)], -1)
+    reached = alignment(steps["samples"][:, -1], start["human", "omega"])
+    total = torch.cat([reached, steps["reward"].sum(1)], -1)
     ours, theirs = total.double().numpy(), np.zeros((HUMANS, 2))
     for i in range(HUMANS):
         given = {key: start["human", key][i].double().numpy() for key in ("omega", "noise")}

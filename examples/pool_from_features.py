@@ -2,7 +2,15 @@
 
 import torch
 
-from torchrl_pref import Belief, Boltzmann, Normalizer, QueryEnv, QueryPool, SimulatedHuman
+from torchrl_pref import (
+    Belief,
+    Boltzmann,
+    Normalizer,
+    QueryEnv,
+    QueryPool,
+    SimulatedHuman,
+    alignment,
+)
 from torchrl_pref.strategies import Greedy, RandomQuery
 
 # Say, 300 pairs of grasps described by speed, force and clearance.
@@ -14,6 +22,6 @@ model = Boltzmann(tau=3.0)
 env = QueryEnv(pool, SimulatedHuman(model), Belief(model), budget=10, batch_size=(50,))
 for name, strategy in {"random": RandomQuery(), "greedy": Greedy(model)}.items():
     env.set_seed(0)
-    session = env.rollout(10, strategy)
-    alignment = session["next", "metrics", "alignment"][:, -1].mean()
-    print(f"{name}: alignment {alignment:.2f} after 10 answers of each of 50 humans")
+    last = env.rollout(10, strategy)[:, -1]
+    reached = alignment(last["next", "samples"], last["human", "omega"]).mean()
+    print(f"{name}: alignment {reached:.2f} after 10 answers of each of 50 humans")

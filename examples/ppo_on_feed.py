@@ -10,7 +10,15 @@ from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from torchrl_pref import Belief, Boltzmann, FeedEnv, Normalizer, SimulatedHuman, gridworld_pool
+from torchrl_pref import (
+    Belief,
+    Boltzmann,
+    FeedEnv,
+    Normalizer,
+    SimulatedHuman,
+    alignment,
+    gridworld_pool,
+)
 
 UPDATES = int(sys.argv[1]) if len(sys.argv) > 1 else 20
 pool = gridworld_pool()
@@ -35,5 +43,6 @@ for data in Collector(env, actor, auto_register_policy_transforms=False, **frame
         (losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]).backward()
         optimizer.step()
         optimizer.zero_grad()
-    final = data["next", "metrics", "alignment"][data["next", "done"]].mean()
+    reached = alignment(data["next", "samples"], data["human", "omega"])
+    final = reached[data["next", "done"]].mean()
     print(f"asks {data['action'].float().mean():.0%}, alignment at the end {final:.2f}")

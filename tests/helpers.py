@@ -34,7 +34,7 @@ def make(
     **options: object,
 ) -> QueryEnv | FeedEnv:
     belief = Belief(model, samples=20, moves=2)
-    options = {"budget": 5, "batch_size": (batch,), **options}
+    options = {"budget": 5, "batch_size": (batch,), "seed": 0, **options}
     return kind(pool, SimulatedHuman(model), belief, **options)  # type: ignore[arg-type]
 
 
@@ -45,7 +45,7 @@ def coin(env: QueryEnv | FeedEnv, seed: int = 0) -> TensorDictModule:
 def session_of(env: QueryEnv | FeedEnv) -> TensorDictBase:
     """A session after one answer."""
     ask = RandomQuery() if isinstance(env, QueryEnv) else RandomAsk()
-    return env.rollout(1, ask)[:, -1]["next"].exclude("reward")
+    return env.step_mdp(env.step(ask(env.reset())))
 
 
 OF_POLICY: dict[str, dict[str, Any]] = {

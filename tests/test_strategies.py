@@ -43,7 +43,7 @@ def test_random_strategies_have_their_own_seeded_luck(pool: QueryPool) -> None:
 def test_greedy_obeys_the_mask(pool: QueryPool) -> None:
     env = make(QueryEnv, pool, repeats=False)
     greedy = Greedy(RESPONSE_MODELS[0])
-    asked = env.rollout(5, greedy)["next", "history", "queries"][:, -1]
+    asked = env.rollout(5, greedy)["next", "session", "history", "index"][:, -1]
     assert all(len(row.unique()) == 5 for row in asked)
 
 
@@ -69,8 +69,10 @@ def test_lookahead_agrees_with_brute_force(
     chosen = Lookahead(model, beam=8)(session.clone())["action"]
     assert (chosen < 5).all()
     last = session.clone()
-    last["history", "queries"][:, :4] = 0
-    gain = make_objective("information_gain").forecast(last, last["queries"], model)
+    last["session", "history", "answers"][:, :4] = 0
+    gain = make_objective("information_gain").forecast(
+        last["session"], last["human"], last["queries"], model
+    )
     final = Lookahead(model, beam=8)(last)["action"]
     assert torch.allclose(gain[range(5), final], gain[:, :5].amax(1), atol=1e-6)
     for b in range(5):

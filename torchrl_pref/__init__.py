@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from torchrl_pref.beliefs.sampled import Belief
     from torchrl_pref.envs.feed import FeedEnv
+    from torchrl_pref.envs.objectives import alignment
     from torchrl_pref.envs.query import QueryEnv
     from torchrl_pref.humans.simulated import SimulatedHuman
     from torchrl_pref.pool import Normalizer, QueryPool
@@ -31,6 +32,7 @@ __all__ = [
     "ResponseModel",
     "SimulatedHuman",
     "Weak",
+    "alignment",
     "calibrate_tau",
     "gridworld_pool",
 ]
@@ -38,6 +40,7 @@ __all__ = [
 _MODULES = {
     "beliefs.sampled": ("Belief",),
     "envs.feed": ("FeedEnv",),
+    "envs.objectives": ("alignment",),
     "envs.query": ("QueryEnv",),
     "humans.simulated": ("SimulatedHuman",),
     "pool": ("Normalizer", "QueryPool"),

@@ -12,12 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torchrl.envs import EnvBase
 
 from torchrl_pref.beliefs.sampled import uniform_sphere
 from torchrl_pref.checkpoints.checkpoint import Checkpoint, picks_by_index
 from torchrl_pref.checkpoints.restore import restore_weights
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
+from torchrl_pref.envs.session import is_feed
 from torchrl_pref.errors import InputError, check_positive, check_seed
 from torchrl_pref.groups import OWN, find, make
 from torchrl_pref.policies.base import Policy
@@ -268,10 +270,10 @@ def _session_arguments(settings: Settings, task: Task, sessions: int, seed: int)
     }
 
 
-def make_policy(settings: Settings, env: QueryEnv | FeedEnv) -> Policy:
+def make_policy(settings: Settings, env: EnvBase) -> Policy:
     """The policy of the setting ``policy``, untrained, to fit an environment."""
     section = settings["policy"]
-    if section.get("start", ...) is None and settings["setup"]["name"] == "query":
+    if section.get("start", ...) is None and not is_feed(env):
         section = {**section, "start": settings["objective"]}  # as trained, whatever env rewards
     made: Policy = make("policy", section, env, without=("sample",))
     return made
@@ -306,7 +308,7 @@ def load_weights(policy: Policy, checkpoint: Checkpoint) -> None:
     restore_weights(policy.weights, checkpoint.weights)
 
 
-def load_policy(checkpoint: Checkpoint, env: QueryEnv | FeedEnv) -> Policy:
+def load_policy(checkpoint: Checkpoint, env: EnvBase) -> Policy:
     """A trained policy, to fit an environment.
 
     Raises:

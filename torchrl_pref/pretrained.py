@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from torchrl.envs import EnvBase
+
 from torchrl_pref.build import load_policy
 from torchrl_pref.checkpoints.checkpoint import Checkpoint
-from torchrl_pref.envs.feed import FeedEnv
-from torchrl_pref.envs.query import QueryEnv
+from torchrl_pref.envs.session import is_feed
 from torchrl_pref.errors import InputError, check_choice, check_count
 from torchrl_pref.policies.base import Policy
 from torchrl_pref.runs import CHECKPOINT
@@ -39,7 +40,7 @@ def pretrained_checkpoint(setup: str, tau: str, seed: int = 0) -> Checkpoint:
     return Checkpoint.load(FOLDER / f"{setup}-{tau}-{seed}.pt")
 
 
-def pretrained_policy(env: QueryEnv | FeedEnv, tau: str, seed: int = 0) -> Policy:
+def pretrained_policy(env: EnvBase, tau: str, seed: int = 0) -> Policy:
     """A trained scorer for an environment: any pool, any number of options and features.
 
     Args:
@@ -50,8 +51,8 @@ def pretrained_policy(env: QueryEnv | FeedEnv, tau: str, seed: int = 0) -> Polic
     Raises:
         InputError: there is no such policy, or the feed's skips are not free.
     """
-    setup = "feed" if isinstance(env, FeedEnv) else "query"
-    if isinstance(env, FeedEnv) and env.skip != "free":
+    setup = "feed" if is_feed(env) else "query"
+    if setup == "feed" and env.skip != "free":
         raise InputError(
             f"skip={env.skip!r}: a pretrained feed policy was trained with free skips and a budget "
             'of asks; make the environment with skip="free"'

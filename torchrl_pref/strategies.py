@@ -14,11 +14,12 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Generator, Tensor
+from torchrl.envs import EnvBase
 
 from torchrl_pref.acquisition.functions import Acquisition, information_gain
 from torchrl_pref.acquisition.scoring import moments_among, predict_answers, score_queries, together
 from torchrl_pref.beliefs.per_belief import PerBelief
-from torchrl_pref.envs.feed import FeedEnv
+from torchrl_pref.envs.transition import OPEN
 from torchrl_pref.errors import check_count, check_share
 from torchrl_pref.questions.responses import ResponseModel
 
@@ -87,7 +88,7 @@ class Lookahead(TensorDictModuleBase):
         beam: first steps to follow.
     """
 
-    in_keys = ["samples", "queries", "action_mask", ("history", "queries")]
+    in_keys = ["samples", "queries", "action_mask", ("session", "history", "answers")]
     out_keys = ["action"]
 
     def __init__(self, response_model: ResponseModel, beam: int = 20) -> None:
@@ -109,7 +110,8 @@ class Lookahead(TensorDictModuleBase):
         probs = predicted.probs[0]  # (C M R)
         entropy = torch.special.entr(probs).sum(-1)
         value, first = gain.topk(min(self.beam, len(gain)))
-        if (session["history", "queries"] < 0).sum() <= 1:  # no second step after the last
+        n_open = (session["session", "history", "answers"] == OPEN).sum()
+        if n_open <= 1:  # no second step after the last
             return first[0]
         joint = probs[first].mT / probs.shape[1]  # (beam R M): P(answer and sample)
         of_answer = joint.sum(-1, keepdim=True)
@@ -160,7 +162,7 @@ class ThresholdAsk(TensorDictModuleBase):
     out_keys = ["action"]
 
     def __init__(
-        self, env: FeedEnv, threshold: float, acquisition: Acquisition = information_gain
+        self, env: EnvBase, threshold: float, acquisition: Acquisition = information_gain
     ) -> None:
         super().__init__()
         self.response_model, self.acquisition = env.belief.response_model, acquisition
@@ -190,7 +192,7 @@ class QuantileAsk(TensorDictModuleBase):
 
     def __init__(
         self,
-        env: FeedEnv,
+        env: EnvBase,
         acquisition: Acquisition = information_gain,
         late: Acquisition | None = None,
     ) -> None:
@@ -221,7 +223,7 @@ class OfferRank:
     """
 
     def __init__(
-        self, env: FeedEnv, acquisition: Acquisition, late: Acquisition | None = None
+        self, env: EnvBase, acquisition: Acquisition, late: Acquisition | None = None
     ) -> None:
         self.response_model = env.belief.response_model
         both = (acquisition,) if late is None else (acquisition, late)

@@ -21,7 +21,10 @@ from torchrl.envs.utils import check_env_specs
 
 from torchrl_pref.beliefs.sampled import Belief
 from torchrl_pref.envs.feed import FeedEnv
+from torchrl_pref.envs.objectives import alignment as true_alignment
+from torchrl_pref.envs.objectives import alignment_of_mean
 from torchrl_pref.envs.query import QueryEnv
+from torchrl_pref.envs.transition import LEFT_OUT, NOT_OF_THE_POOL, OPEN
 from torchrl_pref.errors import InputError
 from torchrl_pref.humans.simulated import SimulatedHuman
 from torchrl_pref.pool import QueryPool
@@ -57,8 +60,8 @@ def test_agrees_with_the_reference_step_by_step(
             sessions.append(Session(*arguments))
     policy = coin(env)
     for _ in range(12):
-        td = policy(td)
-        after = env.step(td)["next"]
+        td = env.step(policy(td))
+        after = td["next"]
         for b, session in enumerate(sessions):
             if td["done"][b]:
                 continue
@@ -73,22 +76,24 @@ def test_agrees_with_the_reference_step_by_step(
                 reward = session.ask(action, samples)
             asked = len(session.queries)
             assert float(after["reward"][b]) == pytest.approx(reward, abs=1e-5)
-            assert after["history", "queries"][b, :asked].tolist() == session.queries
-            assert after["history", "answers"][b, :asked].tolist() == session.answers
-            assert (after["history", "answers"][b, asked:] == -1).all()
+            known = after["session"][b]
+            history = known["history"]
+            assert history["index"][:asked].tolist() == session.queries
+            assert torch.equal(history["options"][:asked], pool.features[session.queries])
+            assert history["answers"][:asked].tolist() == session.answers
+            assert (history["index"][asked:] == NOT_OF_THE_POOL).all()
+            assert (history["answers"][asked:] == OPEN).all()
             assert after["n_asked"][b] == asked
             assert after["terminated"][b] == session.done
-            metrics = after["metrics"][b]
-            assert float(metrics["information"]) == pytest.approx(session.information, abs=1e-4)
-            new = after["samples"][b].double().numpy()
-            assert float(metrics["alignment"]) == pytest.approx(
-                alignment(new, session.omega), abs=1e-5
-            )
+            assert float(known["information"]) == pytest.approx(session.information, abs=1e-4)
+            belief, omega = after["samples"][b : b + 1], td["human", "omega"][b : b + 1]
+            new = belief[0].double().numpy()
             mean = new.mean(0, keepdims=True)
-            of_mean = float(metrics["alignment_of_mean"])
-            assert of_mean == pytest.approx(alignment(mean, session.omega), abs=1e-5)
+            for ours, theirs in ((true_alignment, new), (alignment_of_mean, mean)):
+                expected = alignment(theirs, session.omega)
+                assert float(ours(belief, omega)) == pytest.approx(expected, abs=1e-5)
             assert np.allclose(after["mean"][b].numpy(), mean[0], atol=1e-6)
-        td = after.exclude("reward")
+        td = env.step_mdp(td)
 
 
 @pytest.mark.parametrize("options", [2, 3])
@@ -124,10 +129,13 @@ def test_seed_fixes_every_bit_and_global_state_is_left_alone(kind: type, pool: Q
 
 @pytest.mark.parametrize("kind", ENVS)
 def test_given_humans_are_faced(kind: type, pool: QueryPool) -> None:
-    humans = make(kind, pool, seed=1).reset().select("human", "samples")
+    prior = ("session", "samples")
+    humans = make(kind, pool, seed=1).reset().select("human", prior)
     env = make(kind, pool, seed=2)
     td = env.reset(humans.clone(), set_state=True)
-    assert (td.select("human", "samples") == humans).all()
+    number = ("human", "number")
+    assert (td.select("human", prior).exclude(number) == humans.exclude(number)).all()
+    assert torch.equal(td["samples"], humans[prior])
     assert (td["n_asked"] == 0).all()
     ignored = env.reset(humans.clone(), set_state=False)
     assert not torch.equal(ignored["human", "omega"], humans["human", "omega"])
@@ -135,11 +143,12 @@ def test_given_humans_are_faced(kind: type, pool: QueryPool) -> None:
 
 def test_set_state_goes_on_mid_session(pool: QueryPool) -> None:
     env = make(QueryEnv, pool)
-    middle = env.rollout(3, coin(env))[:, -1]["next"]
-    state = middle.select(*env.state_spec.keys())
+    middle = env.step_mdp(env.rollout(3, coin(env))[:, -1])
+    state = middle.select(*env.state_spec.keys()).clone()
     resumed = env.reset(state, set_state=True)
     for key in env.observation_spec.keys(True, True):
-        assert torch.equal(resumed[key], middle[key])
+        assert torch.equal(resumed[key], middle[key]) or key == ("session", "number")
+    assert (resumed["session", "number"] != middle["session", "number"]).all()
 
 
 @pytest.mark.parametrize("kind", ENVS)
@@ -178,7 +187,7 @@ def test_candidates_are_a_fresh_subset_for_each_session(pool: QueryPool) -> None
 def test_without_repeats_every_question_is_new(pool: QueryPool) -> None:
     small = QueryPool(pool.features[:6])
     env = make(QueryEnv, small, repeats=False)
-    asked = env.rollout(5, coin(env))["next", "history", "queries"][:, -1]
+    asked = env.rollout(5, coin(env))["next", "session", "history", "index"][:, -1]
     assert all(len(row.unique()) == 5 for row in asked)
     with pytest.raises(InputError, match=r"setup\.repeats=false with 4 candidates"):
         make(QueryEnv, small, repeats=False, candidates=4)
@@ -213,7 +222,7 @@ def test_works_in_parallel_env() -> None:
         env.set_seed(0)
         data = env.rollout(25, break_when_any_done=False)
         assert data.shape == (2, 2, 25)
-        assert not torch.equal(data["human", "omega"][0], data["human", "omega"][1])
+        assert not torch.equal(data["samples"][0], data["samples"][1])
     finally:
         env.close()
 
@@ -221,7 +230,7 @@ def test_works_in_parallel_env() -> None:
 def test_action_mask_is_obeyed_by_random_actions(pool: QueryPool) -> None:
     small = QueryPool(pool.features[:6])
     env = TransformedEnv(make(QueryEnv, small, repeats=False), ActionMask())
-    asked = env.rollout(5)["next", "history", "queries"][:, -1]
+    asked = env.rollout(5)["next", "session", "history", "index"][:, -1]
     assert all(len(row.unique()) == 5 for row in asked)
 
 
@@ -246,11 +255,11 @@ def test_bad_options_are_refused(
 
 def test_belief_may_assume_another_model_than_the_human(pool: QueryPool) -> None:
     human, belief = SimulatedHuman(Boltzmann(0.5)), Belief(RESPONSE_MODELS[1], 20, 2)
-    env = QueryEnv(pool, human, belief, 15, batch_size=(20,))
+    env = QueryEnv(pool, human, belief, 15, batch_size=(20,), seed=0)
     last = env.rollout(15, RandomQuery())[:, -1]["next"]
     assert last["samples"].isfinite().all()
     # A careless human contradicts themselves; such answers are left out of the history.
-    assert (last["history", "answers"] == -1).any()
+    assert (last["session", "history", "answers"] == LEFT_OUT).any()
 
 
 def _read_keys(module: TensorDictSequential) -> set[str]:
@@ -262,7 +271,7 @@ def test_strategies_do_not_read_what_is_hidden(pool: QueryPool) -> None:
     from torchrl_pref.policies.scorer import scorer_policy
     from torchrl_pref.strategies import Greedy
 
-    hidden = {"human", "metrics", "history", "offers"}
+    hidden = {"human", "session", "offers", "candidates"}
     modules: list[TensorDictBase] = [RandomQuery(), RandomAsk(), Greedy(RESPONSE_MODELS[0])]
     for kind in ENVS:
         for policy in (paper_policy, scorer_policy):

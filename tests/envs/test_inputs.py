@@ -26,6 +26,8 @@ from torchrl_pref.questions.responses import Boltzmann, Optimal
 
 MODEL = RESPONSE_MODELS[0]
 
+HISTORY = ("session", "history")
+
 
 def env_of(kind: type, pool: QueryPool, **options: Any) -> QueryEnv | FeedEnv:
     options = {"budget": 5, "batch_size": (4,), **options}
@@ -290,7 +292,7 @@ def spoiled(pool: QueryPool, key: Any, change: Callable[[torch.Tensor], torch.Te
     env = env_of(FeedEnv, pool)
     state = env.reset()
     for _ in range(3):
-        state = env.step(state.set("action", torch.tensor([1, 1, 1, 1])))["next"]
+        state = env.step_mdp(env.step(state.set("action", torch.tensor([1, 1, 1, 1]))))
     state = state.select(*env.state_spec.keys()).clone()
     env.reset(state, set_state=True)  # as it is, it is taken
     state[key] = change(state[key])
@@ -306,15 +308,22 @@ def spoiled(pool: QueryPool, key: Any, change: Callable[[torch.Tensor], torch.Te
         (("human", "omega"), lambda x: x.to(torch.complex64), "complex"),
         (("human", "omega"), lambda x: x.double() * 1e300, "too large for float32"),
         (("human", "care"), lambda x: -x, "human.care of 0 or less"),
-        ("samples", lambda x: x * 2, "samples that are not of length 1"),
-        ("samples", lambda x: x.long(), "samples of dtype torch.int64: expected torch.float32"),
-        (("history", "answers"), lambda x: x + 1, "history.answers from 0 to 2: expected -1 to 1"),
-        (("history", "queries"), lambda x: x + 60, "history.queries from"),
-        ("n_asked", lambda x: x + 9, "n_asked from 12 to 12: expected 0 to 5"),
-        ("n_asked", lambda x: x - 1, "history and n_asked contradict each other"),
-        ("n_offered", lambda x: x - 9, "n_offered from -6 to -6: expected 0 to 10"),
+        (("session", "samples"), lambda x: x * 2, "samples that are not of length 1"),
+        (
+            ("session", "samples"),
+            lambda x: x.long(),
+            "samples of dtype torch.int64: expected torch.float32",
+        ),
+        ((*HISTORY, "answers"), lambda x: x + 1, "history.answers from 0 to 2: expected -3 to 1"),
+        ((*HISTORY, "answers"), lambda x: x - 3, "history.answers from -4 to -"),
+        ((*HISTORY, "index"), lambda x: x + 60, "history.index from"),
+        ((*HISTORY, "index"), lambda x: x * 0, "n_asked contradict each other"),
+        ((*HISTORY, "options"), lambda x: x / 0.0, "history.options: NaN"),
+        (("session", "n_asked"), lambda x: x + 9, "n_asked from 12 to 12: expected 0 to 5"),
+        (("session", "n_asked"), lambda x: x - 1, "n_asked contradict each other"),
+        (("session", "n_offered"), lambda x: x - 9, "n_offered from -6 to -6: expected 0 to 10"),
         ("offers", lambda x: x - 60, "offers from"),
-        (("metrics", "ess"), lambda x: x * math.nan, "metrics.ess: NaN"),
+        (("session", "ess"), lambda x: x * math.nan, "session.ess: NaN"),
     ],
 )
 def test_an_impossible_state_is_refused(
@@ -326,11 +335,12 @@ def test_an_impossible_state_is_refused(
 def test_a_history_comes_with_its_belief_and_whole(pool: QueryPool) -> None:
     env = env_of(QueryEnv, pool)
     state = env.step(env.reset().set("action", torch.tensor([1, 2, 3, 4])))["next"]
+    history, n_asked, samples = (("session", key) for key in ("history", "n_asked", "samples"))
     assert "without the samples" in refused(
-        lambda: env.reset(state.select("history", "n_asked"), set_state=True)
+        lambda: env.reset(state.select(history, n_asked), set_state=True)
     )
     assert "a history in part" in refused(
-        lambda: env.reset(state.select("history", "samples"), set_state=True)
+        lambda: env.reset(state.select(history, samples), set_state=True)
     )
 
 

@@ -26,7 +26,8 @@ def test_rewards_add_up_to_the_potential(kind: type, name: str, pool: QueryPool)
     data = env.rollout(5, coin(env), break_when_any_done=False)
     objective = make_objective(name)
     total = data["next", "reward"].sum(1)
-    gained = objective.potential(data["next"][:, -1]) - objective.potential(data[:, 0])
+    first, last = data["session"][:, 0], data["next", "session"][:, -1]
+    gained = objective.gained(first, last, data["human"][:, 0])
     assert torch.allclose(total, gained, atol=1e-5)
     assert total.abs().min() > 1e-4 or kind is FeedEnv
 
@@ -37,7 +38,7 @@ def test_forecast_agrees_with_brute_force(model: ResponseModel, name: str, pool:
     env = make(QueryEnv, pool, model, objective=name)
     session = session_of(env)
     queries = session["queries"][:, :6]
-    forecast = make_objective(name).forecast(session, queries, model)
+    forecast = make_objective(name).forecast(session["session"], session["human"], queries, model)
     tau = getattr(model, "tau", None)
     for b in range(4):
         samples, omega = (
@@ -67,11 +68,12 @@ def test_forecast_is_the_mean_of_what_asking_adds(name: str, pool: QueryPool) ->
     """Over humans drawn from the prior, by whatever they answer."""
     model = RESPONSE_MODELS[0]
     env = QueryEnv(
-        pool, SimulatedHuman(model), Belief(model), 1, batch_size=(3000,), objective=name
+        pool, SimulatedHuman(model), Belief(model), 1, batch_size=(3000,), objective=name, seed=0
     )
     session = env.reset()
     session["action"] = torch.full((3000,), 7)
-    forecast = make_objective(name).forecast(session, session["queries"][:, 7:8], model)
+    known, human, asked = session["session"], session["human"], session["queries"][:, 7:8]
+    forecast = make_objective(name).forecast(known, human, asked, model)
     reward = env.step(session)["next", "reward"]
     error = (reward - forecast).std() / 3000**0.5
     # Of 100 samples, both the length of the mean and the nearest distances are a little biased.
@@ -87,8 +89,11 @@ def test_regret_costs_what_asking_would_have_gained(pool: QueryPool) -> None:
         asked = env.step(session.clone().set("action", torch.ones(4, dtype=torch.long)))
         skipped = env.step(session.clone().set("action", torch.zeros(4, dtype=torch.long)))
         assert torch.equal(asked["next", "reward"], -skipped["next", "reward"])
-        forecast = env._objective.forecast(
-            session, session["offer"].unsqueeze(1), env.belief.response_model
+        forecast = make_objective(name).forecast(
+            session["session"],
+            session["human"],
+            session["offer"].unsqueeze(1),
+            env.belief.response_model,
         )
         assert torch.allclose(asked["next", "reward"], forecast, atol=1e-6)
 
@@ -128,7 +133,7 @@ def test_entropy_falls_by_a_bit_for_a_halved_interval() -> None:
     for width in (0.4, 0.2):
         angles = torch.linspace(-width, width, 400)
         samples = torch.stack([angles.cos(), angles.sin()], -1).unsqueeze(0)
-        potentials.append(make_objective("entropy").potential({"samples": samples}))  # type: ignore[arg-type]
+        potentials.append(make_objective("entropy").potential({"samples": samples}, {}))  # type: ignore[arg-type]
     assert float(potentials[1] - potentials[0]) == pytest.approx(1, abs=0.02)
 
 
@@ -139,7 +144,7 @@ def test_entropy_is_told_by_the_distance_to_the_third_nearest(generator: Generat
         distances = np.linalg.norm(each[:, None] - each, axis=-1)
         third = np.sort(distances, axis=1)[:, 3]  # the nearest of all is the sample itself
         expected.append(-3 * np.log2(third).mean())
-    potential = make_objective("entropy").potential({"samples": samples})  # type: ignore[arg-type]
+    potential = make_objective("entropy").potential({"samples": samples}, {})  # type: ignore[arg-type]
     assert potential.squeeze(-1).tolist() == pytest.approx(expected, abs=1e-4)
 
 

@@ -13,6 +13,7 @@ from torch import Generator
 from torchrl_pref.acquisition.functions import alignment_gain
 from torchrl_pref.build import make_query_env
 from torchrl_pref.envs.feed import FeedEnv
+from torchrl_pref.envs.objectives import alignment, alignment_of_mean
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.errors import InputError
 from torchrl_pref.evaluation.comparison import (
@@ -37,10 +38,16 @@ def test_query_curves_are_those_of_the_rollout(pool: QueryPool) -> None:
     env.set_seed(5)
     start = env.reset(humans.clone(), set_state=True)
     data = env.rollout(5, RandomQuery(3), auto_reset=False, tensordict=start)
-    for name in CURVES:
-        curve = torch.cat([start["metrics", name], data["next", "metrics", name].squeeze(-1)], 1)
+    states = [start["session"], *data["next", "session"].unbind(1)]
+    for name in ("information", "ess"):
+        curve = torch.cat([state[name] for state in states], 1)
         assert torch.equal(getattr(result, name), curve)
-    asked = data["next", "history", "queries"][:, -1]
+    for measure in (alignment, alignment_of_mean):
+        curve = torch.cat(
+            [measure(state["samples"], humans["human", "omega"]) for state in states], 1
+        )
+        assert torch.equal(getattr(result, measure.__name__), curve)
+    asked = data["next", "session", "history", "index"][:, -1]
     assert result.repeated.tolist() == [5 - len(row.unique()) for row in asked]
     assert (result.asked == 5).all()
     assert (result.information.diff(dim=1) >= 0).all()
@@ -88,7 +95,7 @@ def test_strategies_face_the_same_humans_and_luck(pool: QueryPool) -> None:
     ):
         start = env.reset(humans.clone(), set_state=True)
         data = env.rollout(5, strategy, auto_reset=False, tensordict=start)
-        answers.append(data["next", "history", "answers"][:, -1])
+        answers.append(data["next", "session", "history", "answers"][:, -1])
     assert torch.equal(answers[0], answers[1])
     assert torch.equal(answers[0], answers[2])
     assert 0 < float(answers[0].float().mean()) < 1

@@ -74,7 +74,9 @@ def test_scorer_starts_as_the_greedy_strategy_of_its_objective(
     session = session_of(env)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         chosen = scorer_policy(env).strategy(session.clone())["action"]
-    forecast = make_objective(objective).forecast(session, session["queries"], model)
+    forecast = make_objective(objective).forecast(
+        session["session"], session["human"], session["queries"], model
+    )
     rows = torch.arange(20)
     assert torch.allclose(forecast[rows, chosen], forecast.amax(1), atol=1e-5)
 

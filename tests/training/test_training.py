@@ -119,7 +119,7 @@ def test_a_batch_has_the_values_of_each_state_and_the_next(
     ended = batch["next", "done"]
     length = "n_offered" if setup == "feed" else "n_asked"
     assert torch.equal(batch["next", "step_count"][ended], whole["next", length][ended])
-    assert not {"samples", "human", "history"} & set(batch.keys()) or policy == "attention"
+    assert not {"samples", "human", "session"} & set(batch.keys()) or policy == "attention"
 
 
 def test_critic_steps_bring_the_critic_to_the_returns() -> None:

@@ -6,11 +6,12 @@ Shapes: as in ``envs.session``.
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_pref.beliefs.base import BeliefBase
-from torchrl_pref.envs.session import SessionEnv, State
+from torchrl_pref.envs.session import SessionEnv
+from torchrl_pref.envs.transition import Session, Tree
 from torchrl_pref.errors import check_choice, check_count
 from torchrl_pref.humans.base import HumanBase
 from torchrl_pref.pool import QueryPool
@@ -36,23 +37,13 @@ class FeedEnv(SessionEnv):
         skip: ``regret`` or ``free``.
         objective: a name of ``objectives.OBJECTIVES``; the default is the paper's.
         batch_size: (B,), sessions that run side by side.
-        seed: seeds the environment's own generator; the global generators are never used.
+        seed: seeds the environment's own generator; the global generators are never used. None: no
+            two environments, in whatever process, face the same humans.
         device: where the tensors live.
 
     Raises:
         InputError: a number is below its minimum, or ``on_skip`` or ``skip`` is another word.
     """
-
-    _state_keys = (
-        "human",
-        "samples",
-        "mean",
-        "history",
-        "n_asked",
-        "metrics",
-        "offers",
-        "n_offered",
-    )
 
     def __init__(
         self,
@@ -65,7 +56,7 @@ class FeedEnv(SessionEnv):
         skip: str = "regret",
         objective: str = "information_gain",
         batch_size: tuple[int, ...] = (64,),
-        seed: int = 0,
+        seed: int | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
         super().__init__(pool, human, belief, budget, objective, batch_size, seed, device)
@@ -81,44 +72,46 @@ class FeedEnv(SessionEnv):
         """O: a session that asks less sees every offer."""
         return self.n_offers
 
-    def _fresh_state(self) -> TensorDict:
-        state = super()._fresh_state()
-        shape = (self.batch_size.numel(), self.n_offers)
-        offers = torch.randint(
-            len(self.features), shape, generator=self.generator, device=self.device
-        )
-        state["offers"] = offers
-        state["n_offered"] = torch.zeros_like(state["n_asked"])
-        return state
+    def _draw_questions(self, size: int) -> dict[str, Tensor]:
+        n_queries, shape = len(self.features), (size, self.n_offers)
+        offers = torch.randint(n_queries, shape, generator=self.generator, device=self.device)
+        return {"offers": offers}
 
-    def _offered(self, state: State | TensorDictBase) -> Tensor:
+    def _counted(self, session: Session, number: Tensor) -> Session:
+        n_offered = torch.zeros_like(session["n_asked"])
+        return {**super()._counted(session, number), "n_offered": n_offered}
+
+    def _offered(self, session: Session, hidden: Tree) -> Tensor:
         """(B), pool index of the query on offer; after the last offer, the last one."""
-        place = state["n_offered" if self.on_skip == "new" else "n_asked"]
-        return state["offers"].gather(-1, place.clamp(max=self.n_offers - 1)).squeeze(-1)
+        place = session["n_offered" if self.on_skip == "new" else "n_asked"]
+        return hidden["offers"].gather(-1, place.clamp(max=self.n_offers - 1)).squeeze(-1)
 
-    def _observe(self, state: State) -> None:
-        super()._observe(state)
-        offers_left = 1 - state["n_offered"] / self.n_offers
-        state["remaining"] = torch.cat([state["remaining"], offers_left], -1)
-        state["offer"] = self.features[self._offered(state)]
+    def _shown(self, session: Session, hidden: Tree) -> dict[str, Tensor]:
+        shown, n_offered = super()._shown(session, hidden), session["n_offered"]
+        offers_left = 1 - n_offered / self.n_offers
+        shown["remaining"] = torch.cat([shown["remaining"], offers_left], -1)
+        shown["n_offered"] = n_offered.clone()
+        shown["offer"] = self.features[self._offered(session, hidden)]
+        return shown
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = self._check_action(tensordict, 2, "1 to ask and 0 to skip")
-        index = self._offered(tensordict)
-        going_on = (tensordict["n_asked"] < self.budget) & (tensordict["n_offered"] < self.n_offers)
+        hidden, session = self._session_of(tensordict)
+        human, index = hidden["human"], self._offered(session, hidden)
+        n_offered = session["n_offered"]
+        going_on = (session["n_asked"] < self.budget) & (n_offered < self.n_offers)
         asks = (action == 1).unsqueeze(-1)
-        state = self._ask(tensordict, index, (asks & going_on).squeeze(-1))
-        state["n_offered"] = state["n_offered"] + going_on
-        self._observe(state)
+        after = self._ask(session, human, index, (asks & going_on).squeeze(-1))
+        after["n_offered"] = n_offered = n_offered + going_on
         if self.skip == "free":
-            reward = self._objective.potential(state) - self._objective.potential(tensordict)
+            reward = self._objective.gained(session, after, human)
         else:
             query, model = self.features[index].unsqueeze(1), self.belief.response_model
-            worth = self._objective.forecast(tensordict, query, model) * going_on
+            worth = self._objective.forecast(session, human, query, model) * going_on
             reward = torch.where(asks, worth, -worth)
-        out_of_offers = state["n_offered"] >= self.n_offers
-        terminated = state["n_asked"] >= self.budget
+        out_of_offers = n_offered >= self.n_offers
+        terminated = after["n_asked"] >= self.budget
         if self.skip == "free":
             # Scarce offers are part of the task, and nothing is to come after the last.
             terminated = terminated | out_of_offers
-        return self._finish(state, reward, out_of_offers, terminated)
+        return self._finish(after, hidden, reward, out_of_offers, terminated)

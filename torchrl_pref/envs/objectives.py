@@ -11,43 +11,70 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any, TypeAlias
+from typing import Any
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
+from torch.nn import functional as F
 
 from torchrl_pref.acquisition.functions import alignment_gain, information_gain
 from torchrl_pref.acquisition.scoring import predict_answers, score_queries
+from torchrl_pref.envs.transition import Session
 from torchrl_pref.errors import check_choice
 from torchrl_pref.questions.responses import ResponseModel
 
-Session: TypeAlias = TensorDictBase | Mapping[str, Any]
+
+def alignment(samples: Tensor, omega: Tensor) -> Tensor:
+    """The paper's alignment (… 1): mean over samples (… M D) of the cosine with weights (… D).
+
+    Only who knows the human can tell it: it is no part of a session, and no observation.
+    """
+    return F.cosine_similarity(samples, omega.unsqueeze(-2), dim=-1).mean(-1, keepdim=True)
+
+
+def alignment_of_mean(samples: Tensor, omega: Tensor) -> Tensor:
+    """The cosine (… 1) of the mean of samples (… M D) with weights (… D)."""
+    return F.cosine_similarity(samples.mean(-2), omega, dim=-1).unsqueeze(-1)
 
 
 class Objective(ABC):
-    """A quantity of a session that a policy is to raise."""
+    """A quantity of a session that a policy is to raise.
+
+    A session is what ``tell`` makes of it, and its human has at least ``omega`` (B D).
+    """
 
     @abstractmethod
-    def potential(self, session: Session) -> Tensor:
+    def potential(self, session: Session, human: Mapping[str, Any]) -> Tensor:
         """What there is of it in a session, (B 1)."""
 
     @abstractmethod
     def forecast(
-        self, session: TensorDictBase, queries: Tensor, response_model: ResponseModel
+        self,
+        session: Session,
+        human: Mapping[str, Any],
+        queries: Tensor,
+        response_model: ResponseModel,
     ) -> Tensor:
         """What asking each of the queries (B C K D) is expected to add, (B C)."""
+
+    def gained(self, before: Session, after: Session, human: Mapping[str, Any]) -> Tensor:
+        """What there is more of it after than before, (B 1)."""
+        return self.potential(after, human) - self.potential(before, human)
 
 
 class InformationGain(Objective):
     """The paper's: the sum of the information gains of the asked queries, in bits (section 3.3)."""
 
-    def potential(self, session: Session) -> Tensor:
+    def potential(self, session: Session, human: Mapping[str, Any]) -> Tensor:
         """See :meth:`Objective.potential`."""
-        return session["metrics"]["information"]
+        return session["information"]
 
     def forecast(
-        self, session: TensorDictBase, queries: Tensor, response_model: ResponseModel
+        self,
+        session: Session,
+        human: Mapping[str, Any],
+        queries: Tensor,
+        response_model: ResponseModel,
     ) -> Tensor:
         """See :meth:`Objective.forecast`."""
         return score_queries(session["samples"], queries, response_model, information_gain)
@@ -60,12 +87,16 @@ class Alignment(Objective):
     its expectation without the noise of the one hidden ω.
     """
 
-    def potential(self, session: Session) -> Tensor:
+    def potential(self, session: Session, human: Mapping[str, Any]) -> Tensor:
         """See :meth:`Objective.potential`."""
         return session["mean"].square().sum(-1, keepdim=True)
 
     def forecast(
-        self, session: TensorDictBase, queries: Tensor, response_model: ResponseModel
+        self,
+        session: Session,
+        human: Mapping[str, Any],
+        queries: Tensor,
+        response_model: ResponseModel,
     ) -> Tensor:
         """See :meth:`Objective.forecast`."""
         return score_queries(session["samples"], queries, response_model, alignment_gain)
@@ -74,20 +105,24 @@ class Alignment(Objective):
 class TrueAlignment(Objective):
     """The paper's alignment with the simulated human's own ω, which only a simulator knows."""
 
-    def potential(self, session: Session) -> Tensor:
+    def potential(self, session: Session, human: Mapping[str, Any]) -> Tensor:
         """See :meth:`Objective.potential`."""
-        return session["metrics"]["alignment"]
+        return alignment(session["samples"], human["omega"])
 
     def forecast(
-        self, session: TensorDictBase, queries: Tensor, response_model: ResponseModel
+        self,
+        session: Session,
+        human: Mapping[str, Any],
+        queries: Tensor,
+        response_model: ResponseModel,
     ) -> Tensor:
         """See :meth:`Objective.forecast`."""
-        samples, omega = session["samples"], session["human", "omega"].unsqueeze(1)
+        samples, omega = session["samples"], human["omega"].unsqueeze(1)
         cosines = (samples @ omega.mT).unsqueeze(1)
         probs = predict_answers(samples, queries, response_model).probs
         after = (probs * cosines).sum(-2) / probs.sum(-2).clamp(min=1e-30)
         answers = predict_answers(omega, queries, response_model).probs.squeeze(-2)
-        return (answers * after).sum(-1) - self.potential(session)
+        return (answers * after).sum(-1) - self.potential(session, human)
 
 
 class Entropy(Objective):
@@ -97,7 +132,7 @@ class Entropy(Objective):
     no shape of the belief: on the sphere, D-1 bits for every halving of the distances.
     """
 
-    def potential(self, session: Session) -> Tensor:
+    def potential(self, session: Session, human: Mapping[str, Any]) -> Tensor:
         """See :meth:`Objective.potential`."""
         samples = session["samples"]
         nearest = (
@@ -109,7 +144,11 @@ class Entropy(Objective):
         return -(samples.shape[-1] - 1) * bits
 
     def forecast(
-        self, session: TensorDictBase, queries: Tensor, response_model: ResponseModel
+        self,
+        session: Session,
+        human: Mapping[str, Any],
+        queries: Tensor,
+        response_model: ResponseModel,
     ) -> Tensor:
         """The expected loss of entropy is the information gain."""
         return score_queries(session["samples"], queries, response_model, information_gain)

@@ -6,11 +6,14 @@ Shapes: as in ``envs.session``.
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.data import Composite
 
 from torchrl_pref.beliefs.base import BeliefBase
-from torchrl_pref.envs.session import SessionEnv, State
+from torchrl_pref.envs.allowed import AllowedActions, Table
+from torchrl_pref.envs.session import SessionEnv
+from torchrl_pref.envs.transition import Session, Tree
 from torchrl_pref.errors import InputError, check_count, check_flag
 from torchrl_pref.humans.base import HumanBase
 from torchrl_pref.pool import QueryPool
@@ -34,14 +37,13 @@ class QueryEnv(SessionEnv):
         repeats: whether a query may be asked again.
         objective: a name of ``objectives.OBJECTIVES``; the default is the paper's.
         batch_size: (B,), sessions that run side by side.
-        seed: seeds the environment's own generator; the global generators are never used.
+        seed: seeds the environment's own generator; the global generators are never used. None: no
+            two environments, in whatever process, face the same humans.
         device: where the tensors live.
 
     Raises:
         InputError: a number is below its minimum, or without repeats the candidates are too few.
     """
-
-    _state_keys = ("human", "samples", "mean", "history", "n_asked", "metrics", "candidates")
 
     def __init__(
         self,
@@ -53,7 +55,7 @@ class QueryEnv(SessionEnv):
         repeats: bool = True,
         objective: str = "information_gain",
         batch_size: tuple[int, ...] = (64,),
-        seed: int = 0,
+        seed: int | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
         super().__init__(pool, human, belief, budget, objective, batch_size, seed, device)
@@ -66,49 +68,68 @@ class QueryEnv(SessionEnv):
                 ": expected at least as many candidates as asks; raise one or lower the other"
             )
         self.repeats = check_flag("setup.repeats", repeats)
+        self._table = Table()
         self._make_specs(self.n_candidates)
 
-    def _fresh_state(self) -> TensorDict:
-        state = super()._fresh_state()
-        size, n_queries = self.batch_size.numel(), len(self.features)
-        if self.n_candidates == n_queries:
-            chosen = torch.arange(n_queries, device=self.device).expand(size, -1)
-        else:
-            keys = torch.rand((size, n_queries), generator=self.generator, device=self.device)
-            chosen = keys.topk(self.n_candidates, dim=-1).indices
-        return state.set("candidates", chosen)
+    def _draw_questions(self, size: int) -> dict[str, Tensor]:
+        if self._shows_all:
+            return {}
+        shape = (size, len(self.features))
+        keys = torch.rand(shape, generator=self.generator, device=self.device)
+        return {"candidates": keys.topk(self.n_candidates, dim=-1).indices}
 
-    def _observe(self, state: State) -> None:
-        super()._observe(state)
-        candidates = state["candidates"]
-        if self.n_candidates == len(self.features):
+    def _choice_of(self, n_actions: int) -> Composite:
+        inner = super()._choice_of(n_actions)
+        if self.repeats:
+            return inner
+        spec = AllowedActions(action=inner["action"], shape=self.batch_size, device=self.device)
+        spec.table = self._table
+        return spec
+
+    def _put_on_table(self, shown: dict[str, Tensor], begun: Tensor | None) -> None:
+        if not self.repeats:
+            self._table.show(shown["action_mask"], begun)
+
+    @property
+    def _shows_all(self) -> bool:
+        """Whether the whole pool is on the table, in order; an action is then its index."""
+        return self.n_candidates == len(self.features)
+
+    def _shown(self, session: Session, hidden: Tree) -> dict[str, Tensor]:
+        shown, size = super()._shown(session, hidden), len(session["n_asked"])
+        if self._shows_all:
             # A view: the whole pool is the same for every session.
-            state["queries"] = self.features.expand(len(candidates), *self.features.shape)
+            candidates = torch.arange(len(self.features), device=self.device).expand(size, -1)
+            shown["queries"] = self.features.expand(size, *self.features.shape)
         else:
-            state["queries"] = self.features[candidates]
+            candidates = hidden["candidates"]
+            shown["queries"] = self.features[candidates]
         mask = torch.ones_like(candidates, dtype=torch.bool)
         if not self.repeats:
-            asked = state["history"]["queries"]
+            asked = session["history"]["index"]
             mask = ~(candidates.unsqueeze(-1) == asked.unsqueeze(-2)).any(-1)
             # A finished session offers everything again, so that a policy still has a distribution.
             mask = mask | ~mask.any(-1, keepdim=True)
-        state["action_mask"] = mask
+        shown["action_mask"] = mask
+        return shown
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action = self._check_action(tensordict, self.n_candidates, "the place of a candidate")
-        index = tensordict["candidates"].gather(-1, action.unsqueeze(-1)).squeeze(-1)
+        index = self._check_action(tensordict, self.n_candidates, "the place of a candidate")
+        hidden, session = self._session_of(tensordict)
+        if not self._shows_all:
+            index = hidden["candidates"].gather(-1, index.unsqueeze(-1)).squeeze(-1)
         if not self.repeats:
-            self._check_new(tensordict, index)
-        state = self._ask(tensordict, index, tensordict["n_asked"].squeeze(-1) < self.budget)
-        self._observe(state)
-        reward = self._objective.potential(state) - self._objective.potential(tensordict)
-        terminated = state["n_asked"] >= self.budget
-        return self._finish(state, reward, torch.zeros_like(terminated), terminated)
+            self._check_new(session, index)
+        human, going_on = hidden["human"], session["n_asked"].squeeze(-1) < self.budget
+        after = self._ask(session, human, index, going_on)
+        reward = self._objective.gained(session, after, human)
+        terminated = after["n_asked"] >= self.budget
+        return self._finish(after, hidden, reward, torch.zeros_like(terminated), terminated)
 
-    def _check_new(self, tensordict: TensorDictBase, index: Tensor) -> None:
+    def _check_new(self, session: Session, index: Tensor) -> None:
         """Refuse to ask pool query ``index`` (B) again in a session that goes on."""
-        again = (tensordict["history", "queries"] == index.unsqueeze(-1)).any(-1, keepdim=True)
-        if (again & (tensordict["n_asked"] < self.budget)).any():
+        again = (session["history"]["index"] == index.unsqueeze(-1)).any(-1, keepdim=True)
+        if (again & (session["n_asked"] < self.budget)).any():
             raise InputError(
                 "action: a query that was asked before, where repeats=False; expected one that "
                 "action_mask allows; mask the policy, or make the environment with repeats=True"

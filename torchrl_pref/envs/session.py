@@ -1,14 +1,15 @@
-"""The two questions as TorchRL environments: which query to ask, and whether to ask this one.
+"""Sessions as TorchRL environments: what is shown, what is kept, and what a policy never sees.
 
 Shapes: B sessions, M belief samples, N queries in the pool, C candidates of a session, K options
 per query, D features, H query budget, O offers.
 
-A session is one human, from the prior to H answers. A step on a finished session changes nothing
-and is worth nothing, so that ``rollout(break_when_all_done=True)`` can wait for the others. All of
-a session's state is in the tensordict, under these keys, so partial resets, collectors and replay
-work and one environment serves any batch:
+A session is one human, from the prior to H answers. An environment is the transition of
+``envs.transition`` plus where the questions come from and what is rewarded; a step on a finished
+session changes nothing and is worth nothing. All of a session's state is in the tensordict, so
+partial resets, collectors and replay work and one environment serves any batch:
 
 ====================================  ===========================================================
+*shown*: observations, for a policy
 ``samples`` (B M D)                   belief samples of ω
 ``mean`` (B D)                        their mean, the paper's state
 ``remaining`` (B 1) or (B 2)          share of the asks (and of the offers) that is left
@@ -16,53 +17,54 @@ work and one environment serves any batch:
 ``action_mask`` (B C)                 ``QueryEnv``: candidates that may be asked
 ``offer`` (B K D)                     ``FeedEnv``: features of the offered query
 ``n_asked``, ``n_offered`` (B 1)      counts so far (``n_offered`` only in ``FeedEnv``)
-``human`` (omega, noise, care)        hidden: a strategy must not read it
-``history`` (queries, answers)        (B H) pool indices and chosen options, -1 where open
-``offers`` (B O), ``candidates`` …    pool indices of the stream or of the candidates
-``metrics``                           alignment, alignment_of_mean, information, ess (B 1)
+*kept*: ``session``, an observation
+``samples``, ``mean``, ``n_asked`` …  the same again: transforms rewrite what is shown, not these
+``ess``, ``information`` (B 1)        effective sample size; bits gained by the answered queries
+``history``                           options (B H K D), answers and index (B H): ``History``
+``number`` (B 1)                      tells one session from another
+*hidden*: state, and no observation
+``human``                             omega, noise, care and the number of their session
+``offers`` (B O), ``candidates`` …    pool indices of the stream, or of the candidates if not all
 ====================================  ===========================================================
 
-The seed of the constructor is the same for every copy: call ``set_seed`` on a ``ParallelEnv``,
-which gives each worker its own seed, or the workers face the same humans.
+What is hidden stays the same through a session. ``reset`` returns it, and it stands at the root of
+each step's data and not under ``next``. Of what a reset returns, ``SerialEnv`` and ``ParallelEnv``
+hand on the observations alone; there the environment remembers whom it drew, by ``number``.
 """
 
 from __future__ import annotations
 
+import os
 from abc import abstractmethod
-from collections.abc import Sequence
-from typing import Any, TypeAlias
+from collections.abc import Mapping, Sequence
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Generator, Tensor
-from torch.nn import functional as F
 from torchrl.data import Binary, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_pref.acquisition.functions import information_gain
-from torchrl_pref.acquisition.scoring import score_queries
 from torchrl_pref.beliefs.base import BeliefBase
 from torchrl_pref.envs.objectives import make_objective
 from torchrl_pref.envs.state import check_state
+from torchrl_pref.envs.transition import Session, Tree, begin, put, rows, tell
 from torchrl_pref.errors import InputError, check_count, check_type
 from torchrl_pref.humans.base import HumanBase
 from torchrl_pref.pool import QueryPool
 from torchrl_pref.questions.base import check_same
 from torchrl_pref.tensors import check_range, check_shape
 
-State: TypeAlias = TensorDict | dict[str, Any]
-"""A state: a dictionary while a step makes it, as writing to a tensordict takes time."""
 
-
-NESTED = ("human", "history", "metrics")
-"""What of a state holds several tensors."""
+def is_feed(env: EnvBase) -> bool:
+    """Whether an environment, transformed or not, offers queries; if not, it shows candidates."""
+    return "offer" in env.observation_spec.keys()  # noqa: SIM118, a spec is no dictionary
 
 
 class SessionEnv(EnvBase):
-    """What both environments share: a human, a belief, and what an answer does to it."""
+    """What the environments share: a human, a belief, and what an answer does to it."""
 
     _supports_set_state = True
-    _state_keys: tuple[str, ...]
 
     def __init__(
         self,
@@ -72,7 +74,7 @@ class SessionEnv(EnvBase):
         budget: int,
         objective: str,
         batch_size: tuple[int, ...],
-        seed: int,
+        seed: int | None,
         device: torch.device | str,
     ) -> None:
         if not isinstance(batch_size, Sequence) or len(batch_size) != 1:
@@ -82,7 +84,8 @@ class SessionEnv(EnvBase):
         check_type("human", human, HumanBase, "SimulatedHuman(Boltzmann(2.0))")
         check_type("belief", belief, BeliefBase, "Belief(Boltzmann(2.0))")
         check_same(human.response_model.question, belief.response_model.question)
-        check_count("seed", seed, 0)
+        if seed is not None:
+            check_count("seed", seed, 0)
         super().__init__(device=device, batch_size=torch.Size(batch_size))
         self.register_buffer("features", pool.features.to(device))
         self.human = human
@@ -95,26 +98,41 @@ class SessionEnv(EnvBase):
     def _make_specs(self, n_actions: int) -> None:
         """Read the specs off a state, so that no shape is written down twice."""
         rng_state = self._generator.get_state()
-        state = self._start(self._fresh_state())
+        hidden, session = self._fresh()
         self._generator.set_state(rng_state)
-        self.observation_spec = _spec_of(state)
-        self.state_spec = _spec_of(state.select(*self._state_keys))
         batch, device = self.batch_size, self.device
-        self.action_spec = Categorical(n_actions, shape=batch, device=device)
+        shown = self._shown(session, hidden)
+        kept = {"session": session}
+        self.state_spec = _spec_of(TensorDict({**hidden, **kept}, batch, device=device))
+        self.observation_spec = _spec_of(TensorDict({**shown, **kept}, batch, device=device))
+        self.action_spec = self._choice_of(n_actions)
         self.reward_spec = Unbounded(shape=(*batch, 1), device=device)
         flag = Binary(n=1, shape=(*batch, 1), dtype=torch.bool, device=device)
         self.done_spec = Composite(
             done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=batch
         )
+        self._hidden_keys = tuple(hidden)
+        self._remembered = hidden
+
+    def _choice_of(self, n_actions: int) -> Composite:
+        """The spec of an action."""
+        batch, device = self.batch_size, self.device
+        action = Categorical(n_actions, shape=batch, device=device)
+        return Composite(action=action, shape=batch, device=device)
 
     def _set_seed(self, seed: int | None) -> None:
-        self._generator = Generator(self.device).manual_seed(0 if seed is None else seed)
+        """Without a seed humans are new ones each time, in whatever process."""
+        self._seed, self._home = seed, os.getpid()
+        chosen = int.from_bytes(os.urandom(6), "big") if seed is None else seed
+        self._generator = Generator(self.device).manual_seed(chosen)
 
     @property
     def generator(self) -> Generator:
         """The environment's own source of randomness, on its device."""
-        if self._generator.device != self.device:
-            self._set_seed(self._generator.initial_seed())
+        if self._seed is None and self._home != os.getpid():
+            self._set_seed(None)  # this is a copy, in a worker: other humans than the others'
+        elif self._generator.device != self.device:
+            self._generator = Generator(self.device).manual_seed(self._generator.initial_seed())
         return self._generator
 
     @property
@@ -125,10 +143,88 @@ class SessionEnv(EnvBase):
     def _reset(
         self, tensordict: TensorDictBase | None = None, set_state: bool = False, **kwargs: Any
     ) -> TensorDictBase:
-        state = self._fresh_state()
+        hidden, session = self._fresh()
         if set_state and tensordict is not None:
-            state.update(check_state(tensordict, state, len(self.features)).clone())
-        return self._start(state)
+            state = TensorDict({**hidden, "session": session}, self.batch_size, device=self.device)
+            given = check_state(tensordict, state, len(self.features)).clone().to_dict()
+            _overwrite(hidden, given)
+            _overwrite(cast(Tree, session), given.get("session", {}))
+            session["mean"] = session["samples"].mean(1)
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        self._remember(hidden, mask)
+        shown = self._shown(session, hidden)
+        self._put_on_table(shown, mask)
+        return TensorDict(
+            {**hidden, "session": session, **shown}, self.batch_size, device=self.device
+        )
+
+    def _fresh(self) -> tuple[Tree, Session]:
+        """New humans who have answered nothing. The draws that strategies share come first."""
+        size, (_, n_options, n_features) = self.batch_size.numel(), self.features.shape
+        rng, n_answers = self.generator, self.human.response_model.n_answers(n_options)
+        human = self.human.draw(size, self.budget, n_answers, n_features, rng).to_dict()
+        session = begin(self.belief.prior(size, n_features, rng), self.budget, n_options)
+        # The bits of a number of the prior: another one for each session, and no draw more.
+        human["number"] = number = session["samples"][:, 0, :1].clone().view(torch.int32)
+        hidden: Tree = {"human": human, **self._draw_questions(size)}
+        return hidden, self._counted(session, number)
+
+    def _draw_questions(self, size: int) -> dict[str, Tensor]:
+        """What is drawn of the questions to come, for B sessions: hidden."""
+        return {}
+
+    def _counted(self, session: Session, number: Tensor) -> Session:
+        """Sessions that begin, with their numbers. Subclasses may add what else is counted."""
+        return {**session, "number": number}
+
+    def _shown(self, session: Session, hidden: Tree) -> dict[str, Tensor]:
+        """What a policy sees: copies, which may be rewritten. Subclasses add what is asked."""
+        n_asked = session["n_asked"]
+        return {
+            "samples": session["samples"].clone(),
+            "mean": session["mean"].clone(),
+            "n_asked": n_asked.clone(),
+            "remaining": 1 - n_asked / self.budget,
+        }
+
+    def _put_on_table(self, shown: dict[str, Tensor], begun: Tensor | None) -> None:
+        """Tell random actions what is shown now, in all sessions or where they began (B 1)."""
+
+    def _session_of(self, tensordict: TensorDictBase) -> tuple[Tree, Session]:
+        """What is hidden and what is kept of the sessions in a tensordict."""
+        session = {**tensordict["session"]}
+        session["history"] = {**session["history"]}
+        return self._hidden_of(tensordict), cast(Session, session)
+
+    def _hidden_of(self, tensordict: TensorDictBase) -> Tree:
+        """What is hidden of sessions: as they carry it, or else as this environment remembers it.
+
+        Raises:
+            InputError: neither knows of these sessions.
+        """
+        number, human = tensordict["session", "number"], tensordict.get("human", None)
+        if human is not None and torch.equal(human["number"], number):
+            return {key: tensordict[key] for key in self._hidden_keys}
+        hidden = self._remembered
+        if not torch.equal(hidden["human"]["number"].to(number.device), number):
+            raise InputError(
+                "sessions without their humans, which this environment does not remember: expected "
+                "the root of a step's data, or of the sessions that it began last; hand them on by "
+                "step_mdp, or begin others by reset"
+            )
+        if human is not None:  # a worker's buffer, in which no reset writes what is hidden
+            tensordict.select(*self._hidden_keys).update_(hidden)
+        return hidden
+
+    def _remember(self, hidden: Tree, mask: Tensor | None) -> None:
+        """Keep what is hidden of the sessions that begin, where ``mask`` (B 1), or of all."""
+        if mask is None or mask.all():
+            self._remembered = hidden
+        else:
+            who = mask.reshape(-1).nonzero().squeeze(-1)
+            remembered = dict(self._remembered)
+            put(remembered, rows(hidden, who), who)
+            self._remembered = remembered
 
     def _check_action(self, tensordict: TensorDictBase, n_actions: int, meaning: str) -> Tensor:
         """The action (B) of each session; refused unless it is from 0 to ``n_actions`` - 1."""
@@ -136,123 +232,53 @@ class SessionEnv(EnvBase):
         check_shape("action", action, self.batch_size, "one number for each session")
         return action
 
-    def _fresh_state(self) -> TensorDict:
-        """New humans who have answered nothing. The draws that strategies share come first."""
-        size, n_features = self.batch_size.numel(), self.features.shape[-1]
-        rng, device = self.generator, self.device
-        n_answers = self.human.response_model.n_answers(self.features.shape[1])
-        human = self.human.draw(size, self.budget, n_answers, n_features, rng)
-        open_slots = torch.full((size, self.budget), -1, device=device)
-        zero = torch.zeros((size, 1), device=device)
-        return TensorDict(
-            {
-                "human": human,
-                "samples": self.belief.prior(size, n_features, rng),
-                "history": {"queries": open_slots, "answers": open_slots.clone()},
-                "n_asked": zero.long(),
-                "metrics": {"information": zero, "ess": zero + self.belief.n_samples},
-            },
-            self.batch_size,
-            device=device,
-        )
+    def _ask(self, session: Session, human: Tree, index: Tensor, asked: Tensor) -> Session:
+        """The sessions after those marked in ``asked`` (B) asked pool query ``index`` (B).
 
-    def _start(self, state: TensorDict) -> TensorDict:
-        """The observed first state, from what was drawn or given."""
-        state["mean"], measured = _measure(state["samples"], state["human", "omega"])
-        state["metrics"].update(measured)
-        self._observe(state)
-        return state
-
-    def _observe(self, state: State) -> None:
-        """Add to a state what follows from its counts. Subclasses add what is on the table."""
-        state["remaining"] = 1 - state["n_asked"] / self.budget
-
-    def _ask(self, before: TensorDictBase, index: Tensor, asked: Tensor) -> dict[str, Any]:
-        """The state after the sessions marked in ``asked`` (B) asked pool query ``index`` (B).
-
-        What stays the same is shared with the state before: a skip costs next to nothing.
+        What stays the same is shared with the sessions before: a skip costs next to nothing.
         """
-        state = {key: before[key] for key in self._state_keys}
-        for key in NESTED:
-            state[key] = dict(state[key])
         who = asked.nonzero().squeeze(-1)
         if len(who) == len(asked):
-            _put(state, self._answer(state, index), None)
-        elif len(who):
-            _put(state, self._answer(_rows(state, who), index[who]), who)
-        return state
+            return self._answered(session, human, index)
+        after: Tree = {**session}
+        if len(who):
+            part = cast(Session, rows(session, who))
+            put(after, self._answered(part, rows(human, who), index[who]), who)
+        return cast(Session, after)
 
-    def _answer(self, session: dict[str, Any], index: Tensor) -> dict[str, Any]:
-        """What changes in sessions (B) that ask pool queries ``index`` (B)."""
-        human, history, metrics = (session[key] for key in NESTED)
-        queries, model = self.features[index], self.belief.response_model
-        turn, samples = session["n_asked"].squeeze(-1), session["samples"]
-        answers = self.human.respond(queries, human, turn)
-        # On the CPU only as many turns as were taken are worth the work; -1 slots come last.
-        taken = int(turn.max())
-        past, given = (history[key][:, :taken] for key in ("queries", "answers"))
-        options = torch.cat([self.features[past], queries.unsqueeze(1)], 1)
-        evidence = model.evidence(options, torch.cat([given, answers.unsqueeze(1)], 1))
-        ess = metrics["ess"].squeeze(-1)
-        update = self.belief.update(samples, ess, evidence, self.generator)
-        mean, measured = _measure(update.samples, human["omega"])
-        gain = score_queries(samples, queries.unsqueeze(1), model, information_gain)
-        place = torch.arange(history["queries"].shape[1], device=turn.device) == turn.unsqueeze(-1)
-        used = torch.where(update.used, answers, -1)
-        return {
-            "samples": update.samples,
-            "mean": mean,
-            "n_asked": session["n_asked"] + 1,
-            "history": {
-                "queries": torch.where(place, index.unsqueeze(-1), history["queries"]),
-                "answers": torch.where(place, used.unsqueeze(-1), history["answers"]),
-            },
-            "metrics": {
-                **measured,
-                "information": metrics["information"] + gain,
-                "ess": update.ess.unsqueeze(-1),
-            },
-        }
+    def _answered(self, session: Session, human: Tree, index: Tensor) -> Session:
+        """Sessions (B) after their humans answered pool queries ``index`` (B)."""
+        options = self.features[index]
+        answers = self.human.respond(options, human, session["n_asked"].squeeze(-1))
+        return tell(self.belief, session, options, answers, index, self.generator)
 
     def _finish(
-        self, state: dict[str, Any], reward: Tensor, truncated: Tensor, terminated: Tensor
+        self,
+        session: Session,
+        hidden: Tree,
+        reward: Tensor,
+        truncated: Tensor,
+        terminated: Tensor,
     ) -> TensorDict:
-        """The observed next state with its reward and done flags."""
-        state["reward"] = reward
-        state["terminated"] = terminated
-        state["truncated"] = truncated & ~terminated
-        state["done"] = terminated | truncated
-        for key in NESTED:
-            state[key] = TensorDict(state[key], self.batch_size, device=self.device)
-        return TensorDict(state, self.batch_size, device=self.device)
+        """The next state with its reward and done flags; what is hidden stays where it is."""
+        flags = {"terminated": terminated, "truncated": truncated & ~terminated}
+        done = {"done": terminated | truncated, **flags, "reward": reward}
+        shown = self._shown(session, hidden)
+        self._put_on_table(shown, None)
+        after = {"session": session, **shown, **done}
+        return TensorDict(after, self.batch_size, device=self.device)
 
     @abstractmethod
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase: ...
 
 
-def _rows(state: dict[str, Any], who: Tensor) -> dict[str, Any]:
-    """The sessions ``who`` of a state."""
-    return {
-        key: _rows(value, who) if isinstance(value, dict) else value[who]
-        for key, value in state.items()
-    }
-
-
-def _put(state: dict[str, Any], changed: dict[str, Any], who: Tensor | None) -> None:
-    """Put what changed in sessions ``who``, or in all, into a state; no tensor is overwritten."""
-    for key, new in changed.items():
-        if isinstance(new, dict):
-            _put(state[key], new, who)
+def _overwrite(tree: Tree, given: Mapping[str, Any]) -> None:
+    """Take the tensors that are given in the place of a tree's own."""
+    for key in tree.keys() & given.keys():
+        if isinstance(tree[key], dict):
+            _overwrite(tree[key], given[key])
         else:
-            state[key] = new if who is None else state[key].index_copy(0, who, new)
-
-
-def _measure(samples: Tensor, omega: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-    """The mean (B D) of the samples, and the metrics (B 1) that compare them with omega (B D)."""
-    mean = samples.mean(1)
-    cosines = F.cosine_similarity(samples, omega.unsqueeze(1), dim=-1)
-    of_mean = F.cosine_similarity(mean, omega).unsqueeze(-1)
-    return mean, {"alignment": cosines.mean(1, keepdim=True), "alignment_of_mean": of_mean}
+            tree[key] = given[key]
 
 
 def _spec_of(state: TensorDictBase) -> Composite:

@@ -12,6 +12,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from torchrl_pref.envs.transition import LEFT_OUT, NOT_OF_THE_POOL, OPEN, History
 from torchrl_pref.errors import InputError
 from torchrl_pref.tensors import check_finite, check_plain, check_range, check_shape
 
@@ -21,13 +22,20 @@ MEANING = {
     "human.omega": "sessions and features",
     "human.noise": "sessions, asks (the budget) and options",
     "human.care": "sessions and one factor",
-    "samples": "sessions, samples of the belief and features",
-    "history.queries": "sessions and asks (the budget)",
-    "history.answers": "sessions and asks (the budget)",
+    "session.samples": "sessions, samples of the belief and features",
+    "session.mean": "sessions and features",
+    "session.history.options": "sessions, asks (the budget), options and features",
+    "session.history.answers": "sessions and asks (the budget)",
+    "session.history.index": "sessions and asks (the budget)",
     "offers": "sessions and offers",
     "candidates": "sessions and candidates",
 }
 """What the sizes of each part of the state are; of the others they are sessions and one number."""
+
+NUMBERS = (("human", "number"), ("session", "number"))
+"""What an environment makes anew for itself."""
+
+HISTORY: tuple[Key, ...] = tuple(("session", "history", key) for key in History.__annotations__)
 
 
 def check_state(given: TensorDictBase, fresh: TensorDictBase, n_queries: int) -> TensorDict:
@@ -47,7 +55,7 @@ def check_state(given: TensorDictBase, fresh: TensorDictBase, n_queries: int) ->
     state: dict[Key, Tensor] = {}
     parts = dict(given.items(True, True))
     for key, expected in fresh.items(True, True):
-        if key in parts:
+        if key in parts and key not in NUMBERS:
             state[key] = _check_part(_name(key), parts[key], expected)
     if not state:
         raise InputError(
@@ -65,12 +73,16 @@ def _check_ranges(state: dict[Key, Tensor], fresh: TensorDictBase, n_queries: in
     n_asks, n_options = fresh["human", "noise"].shape[1:]
     n_offers = 0 if fresh.get("offers", None) is None else fresh["offers"].shape[1]
     limits: dict[Key, tuple[int, int, str]] = {
-        ("history", "queries"): (-1, n_queries - 1, "indices of the pool, -1 where none was asked"),
-        ("history", "answers"): (-1, n_options - 1, "the chosen option, -1 where there is none"),
+        ("session", "history", "index"): (
+            -1,
+            n_queries - 1,
+            "indices of the pool, -1 for no query",
+        ),
+        ("session", "history", "answers"): (LEFT_OUT, n_options - 1, "the chosen option or a mark"),
         "candidates": (0, n_queries - 1, "indices of the pool"),
         "offers": (0, n_queries - 1, "indices of the pool"),
-        "n_asked": (0, n_asks, "queries asked so far"),
-        "n_offered": (0, n_offers, "queries offered so far"),
+        ("session", "n_asked"): (0, n_asks, "queries asked so far"),
+        ("session", "n_offered"): (0, n_offers, "queries offered so far"),
     }
     for key, limit in limits.items():
         if key in state:
@@ -104,7 +116,7 @@ def _check_part(name: str, value: Tensor, expected: Tensor) -> Tensor:
 
 def _check_vectors(state: dict[Key, Tensor]) -> None:
     """Samples lie on the unit sphere, and a human has a direction."""
-    samples, omega = state.get("samples"), state.get(("human", "omega"))
+    samples, omega = state.get(("session", "samples")), state.get(("human", "omega"))
     if samples is not None and ((samples.norm(dim=-1) - 1).abs() > 0.01).any():
         raise InputError(
             "samples that are not of length 1: expected points of the unit sphere, as tau carries "
@@ -118,24 +130,24 @@ def _check_vectors(state: dict[Key, Tensor]) -> None:
 
 def _check_history(state: dict[Key, Tensor]) -> None:
     """The asked queries are the first ``n_asked``, and the belief knows of their answers."""
-    queries, n_asked = state.get(("history", "queries")), state.get("n_asked")
-    answers = state.get(("history", "answers"))
-    if queries is None and answers is None and n_asked is None:
+    given = [state.get(key) for key in (*HISTORY, ("session", "n_asked"))]
+    options, answers, index, n_asked = given
+    if all(part is None for part in given):
         return
-    if queries is None or answers is None or n_asked is None:
+    if options is None or answers is None or index is None or n_asked is None:
         raise InputError(
-            "a history in part: expected history.queries, history.answers and n_asked together; "
-            "give all three, or none for sessions that begin"
+            "a history in part: expected session.history (options, answers, index) and "
+            "session.n_asked together; give all of them, or none for sessions that begin"
         )
-    asked = queries >= 0
-    first = torch.arange(queries.shape[1], device=queries.device) < n_asked
-    if (asked != first).any() or ((answers >= 0) & ~asked).any():
+    asked = answers != OPEN
+    first = torch.arange(answers.shape[1], device=answers.device) < n_asked
+    if (asked != first).any() or ((index != NOT_OF_THE_POOL) & ~asked).any():
         raise InputError(
-            "history and n_asked contradict each other: expected n_asked queries at the start of "
-            "each history, -1 after them, and no answer without a query"
+            "session.history and session.n_asked contradict each other: expected answers (-2 where "
+            "refused, -3 where left out) to the first n_asked queries, and -1 after them"
         )
-    if asked.any() and "samples" not in state:
+    if asked.any() and ("session", "samples") not in state:
         raise InputError(
             "a history of answers without the samples of the belief that they led to: expected "
-            "both; give samples too, or leave the history out"
+            "both; give session.samples too, or leave the history out"
         )

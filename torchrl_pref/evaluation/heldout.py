@@ -38,6 +38,7 @@ from torchrl_pref.checkpoints.checkpoint import Checkpoint
 from torchrl_pref.compiled import share_out
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
+from torchrl_pref.envs.session import is_feed
 from torchrl_pref.errors import InputError
 from torchrl_pref.evaluation.comparison import FIRST_EVALUATION_SEED
 from torchrl_pref.evaluation.run import Evaluation, draw_humans, evaluate
@@ -301,7 +302,7 @@ def _baselines(
 ) -> dict[str, TensorDictModuleBase]:
     """The strategies that are not learned, by name."""
     model = task.response_model
-    if isinstance(env, FeedEnv):
+    if is_feed(env):
         return {
             "ask all": RandomAsk(),
             f"threshold {job.thresholds[0]:g} bits": ThresholdAsk(env, job.thresholds[0]),

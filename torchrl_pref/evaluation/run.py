@@ -12,15 +12,14 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
-from torchrl_pref.envs.feed import FeedEnv
-from torchrl_pref.envs.query import QueryEnv
+from torchrl_pref.envs.objectives import alignment, alignment_of_mean
 
 CURVES = ("alignment", "alignment_of_mean", "information", "ess")
 
-KEPT = ("n_asked", "n_offered", "metrics", "history")
-"""What an evaluation reads of each step."""
+COUNTS = ("n_asked", "n_offered")
 
 
 @dataclass(frozen=True)
@@ -51,13 +50,13 @@ class Evaluation:
     seconds_per_query: float
 
 
-def draw_humans(env: QueryEnv | FeedEnv) -> TensorDict:
+def draw_humans(env: EnvBase) -> TensorDict:
     """Humans, their luck, prior samples and a feed's offers, for every strategy to start from."""
-    return env.reset().select("human", "samples", "offers", strict=False)
+    return env.reset().select("human", ("session", "samples"), "offers", strict=False)
 
 
 def evaluate(
-    env: QueryEnv | FeedEnv,
+    env: EnvBase,
     strategy: TensorDictModuleBase,
     humans: TensorDictBase,
     sample: bool = False,
@@ -72,25 +71,25 @@ def evaluate(
     """
     mode = ExplorationType.RANDOM if sample else ExplorationType.DETERMINISTIC
     session = env.reset(humans.clone(), set_state=True)
-    before = {name: session["metrics", name].cpu() for name in CURVES}
+    omega = session["human", "omega"]
+    before = _measured(session, omega).cpu()
     start = time.perf_counter()
     steps: list[TensorDictBase] = []
     with torch.no_grad(), set_exploration_type(mode):
         # Not a rollout: that would keep what is on the table, a copy of the pool for each session.
         while len(steps) < env.max_steps and not session["done"].all():
-            session = env.step(strategy(session))
-            steps.append(session["next"].select(*KEPT, strict=False))
-            session = step_mdp(session)
+            session = step_mdp(env.step(strategy(session)))
+            steps.append(_measured(session, omega))
     steps_taken = TensorDict.stack(steps, 1).to("cpu")
     seconds = time.perf_counter() - start
     n_asked = steps_taken["n_asked"].squeeze(-1)
     curves = {
-        name: _by_answers(before[name], steps_taken["metrics", name].squeeze(-1), n_asked, env)
+        name: _by_answers(before[name], steps_taken[name].squeeze(-1), n_asked, env.budget)
         for name in CURVES
     }
     asked = n_asked[:, -1]
-    offered = steps_taken["n_offered"][:, -1, 0] if isinstance(env, FeedEnv) else asked
-    history = steps_taken["history", "queries"][:, -1]
+    offered = steps_taken.get("n_offered", steps_taken["n_asked"])[:, -1, 0]
+    history = session["session", "history", "index"].cpu()
     return Evaluation(
         **curves,
         asked=asked,
@@ -100,10 +99,21 @@ def evaluate(
     )
 
 
-def _by_answers(before: Tensor, values: Tensor, n_asked: Tensor, env: QueryEnv | FeedEnv) -> Tensor:
+def _measured(session: TensorDictBase, omega: Tensor) -> TensorDict:
+    """What an evaluation reads of sessions as they stand, with humans of weights ω (B D)."""
+    kept = session["session"]
+    measured = {
+        "alignment": alignment(kept["samples"], omega),
+        "alignment_of_mean": alignment_of_mean(kept["samples"], omega),
+        **{key: kept[key] for key in ("information", "ess", *COUNTS) if key in kept},
+    }
+    return TensorDict(measured, session.batch_size, device=session.device)
+
+
+def _by_answers(before: Tensor, values: Tensor, n_asked: Tensor, budget: int) -> Tensor:
     """Curve (B H+1) by number of answers, from values (B T) by step and their start (B 1)."""
-    curve = before.repeat(1, env.budget + 1)
-    columns = torch.arange(env.budget + 1)
+    curve = before.repeat(1, budget + 1)
+    columns = torch.arange(budget + 1)
     for value, count in zip(values.unbind(1), n_asked.unbind(1), strict=True):
         # A skip changes nothing, so later steps with the same count write the same value again.
         curve = torch.where(columns >= count.unsqueeze(1), value.unsqueeze(1), curve)

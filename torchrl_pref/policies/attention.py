@@ -8,12 +8,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+from torchrl.envs import EnvBase
 from torchrl.modules import MLP
 
 from torchrl_pref.beliefs.per_belief import PerBelief
 from torchrl_pref.beliefs.resampling import covariance_of
-from torchrl_pref.envs.feed import FeedEnv
-from torchrl_pref.envs.query import QueryEnv
+from torchrl_pref.envs.session import is_feed
 from torchrl_pref.errors import check_choice
 from torchrl_pref.policies.base import (
     Layer,
@@ -88,7 +88,7 @@ class OfferAttention(AttentionScorer):
         return torch.cat([torch.zeros_like(ask), ask], -1)
 
 
-def attention_policy(env: QueryEnv | FeedEnv, tokens: str = "samples") -> Policy:
+def attention_policy(env: EnvBase, tokens: str = "samples") -> Policy:
     """Learned from nothing: options attend to the belief, and no greedy score is among the inputs.
 
     Args:
@@ -101,9 +101,7 @@ def attention_policy(env: QueryEnv | FeedEnv, tokens: str = "samples") -> Policy
     device = torch.device(env.device)
     check_choice("policy.tokens", tokens, TOKENS)
     n_shares = env.observation_spec["remaining"].shape[-1]
-    kind, shown = (
-        (AttentionScorer, "queries") if isinstance(env, QueryEnv) else (OfferAttention, "offer")
-    )
+    kind, shown = (OfferAttention, "offer") if is_feed(env) else (AttentionScorer, "queries")
     network = kind(env.features.shape[-1], n_shares, tokens, device)
     logits = Layer(network, in_keys=["samples", shown, "remaining"], out_keys=["logits"])
     observe = _belief_features(PerBelief(belief_summary))

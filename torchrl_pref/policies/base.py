@@ -14,11 +14,11 @@ from tensordict.nn import (
     TensorDictSequential,
 )
 from torch import Tensor, nn
+from torchrl.envs import EnvBase
 from torchrl.modules import MLP, MaskedCategorical, ProbabilisticActor, ValueOperator
 
 from torchrl_pref.beliefs.resampling import covariance_of
-from torchrl_pref.envs.feed import FeedEnv
-from torchrl_pref.envs.query import QueryEnv
+from torchrl_pref.envs.session import is_feed
 
 
 @dataclass(frozen=True)
@@ -44,15 +44,23 @@ class Policy:
 
     @property
     def strategy(self) -> TensorDictModuleBase:
-        """The whole policy, as the collector and the evaluation run it."""
-        if self.observe is None:
-            return self.actor
-        return TensorDictSequential(self.observe, self.actor)
+        """The whole policy, as a collector, a rollout and the evaluation run it."""
+        modules = (self.actor,) if self.observe is None else (self.observe, self.actor)
+        return Acting(*modules)
 
     @property
     def weights(self) -> nn.ModuleDict:
         """All that is learned, to be saved and loaded by its ``state_dict``."""
         return nn.ModuleDict({"actor": self.actor, "critic": self.critic})
+
+
+class Acting(TensorDictSequential):
+    """Modules that act one after the other, and keep no gradients: a loss calls the actor again."""
+
+    @torch.no_grad()
+    def forward(self, *args: Any, **kwargs: Any) -> TensorDictBase:
+        """Write ``action``, and what it was chosen by."""
+        return super().forward(*args, **kwargs)
 
 
 class PolicyKind(NamedTuple):
@@ -108,9 +116,9 @@ def _belief_critic(n_shares: int, device: torch.device) -> TensorDictSequential:
     return TensorDictSequential(_belief_features(belief_summary), value)
 
 
-def _actor(logits: Layer, env: QueryEnv | FeedEnv) -> ProbabilisticActor:
+def _actor(logits: Layer, env: EnvBase) -> ProbabilisticActor:
     """A categorical actor, masked where the environment says what may be asked."""
-    masked = isinstance(env, QueryEnv)
+    masked = not is_feed(env)
     return ProbabilisticActor(
         logits,
         in_keys={"logits": "logits", "mask": "action_mask"} if masked else ["logits"],

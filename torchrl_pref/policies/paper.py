@@ -8,10 +8,10 @@ from tensordict.nn import (
     TensorDictSequential,
 )
 from torch import nn
+from torchrl.envs import EnvBase
 from torchrl.modules import MLP, ValueOperator
 
-from torchrl_pref.envs.feed import FeedEnv
-from torchrl_pref.envs.query import QueryEnv
+from torchrl_pref.envs.session import is_feed
 from torchrl_pref.policies.base import (
     Layer,
     Policy,
@@ -19,7 +19,7 @@ from torchrl_pref.policies.base import (
 )
 
 
-def paper_policy(env: QueryEnv | FeedEnv) -> Policy:
+def paper_policy(env: EnvBase) -> Policy:
     """The paper's policy: perceptrons on the belief mean, and in the feed on the offered query.
 
     In the query setup an action is an index of the training pool and means nothing on another one.
@@ -34,7 +34,7 @@ def paper_policy(env: QueryEnv | FeedEnv) -> Policy:
     size = env.features.shape[-1]
     state_keys = ["mean"]
     observe = None
-    if isinstance(env, FeedEnv):
+    if is_feed(env):
         size += env.features[0].numel()
         state_keys = ["mean", "flat_offer"]
         observe = Layer(lambda offer: offer.flatten(-2), in_keys=["offer"], out_keys=["flat_offer"])

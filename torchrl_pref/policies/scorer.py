@@ -13,15 +13,15 @@ from tensordict.nn import (
     TensorDictSequential,
 )
 from torch import Tensor, nn
+from torchrl.envs import EnvBase
 from torchrl.modules import MLP
 
 from torchrl_pref.acquisition.functions import alignment_gain, information_gain, volume_removal
 from torchrl_pref.acquisition.scoring import score_queries, standardise, together
 from torchrl_pref.beliefs.per_belief import PerBelief
 from torchrl_pref.beliefs.resampling import covariance_of
-from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.objectives import OBJECTIVES
-from torchrl_pref.envs.query import QueryEnv
+from torchrl_pref.envs.session import is_feed
 from torchrl_pref.errors import InputError, check_choice
 from torchrl_pref.policies.base import (
     N_BELIEF,
@@ -155,7 +155,7 @@ class OfferFeatures(nn.Module):
         env: gives the response model, the pool and the budgets.
     """
 
-    def __init__(self, env: FeedEnv) -> None:
+    def __init__(self, env: EnvBase) -> None:
         super().__init__()
         self.features = CandidateFeatures(env.belief.response_model)
         self.budget, self.n_offers = env.budget, env.n_offers
@@ -197,7 +197,7 @@ def _zero_headed_mlp(n_inputs: int, device: torch.device) -> MLP:
     return network
 
 
-def scorer_policy(env: QueryEnv | FeedEnv, start: str | None = None) -> Policy:
+def scorer_policy(env: EnvBase, start: str | None = None) -> Policy:
     """The default policy: a shared network scores each candidate, so any pool of any size will do.
 
     Args:
@@ -210,7 +210,7 @@ def scorer_policy(env: QueryEnv | FeedEnv, start: str | None = None) -> Policy:
     """
     device = torch.device(env.device)
     n_shares = env.observation_spec["remaining"].shape[-1]
-    if isinstance(env, QueryEnv):
+    if not is_feed(env):
         features = Layer(
             CandidateFeatures(env.belief.response_model),
             in_keys=["samples", "queries"],

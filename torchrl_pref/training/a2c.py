@@ -38,7 +38,7 @@ from torchrl_pref.training.progress import Progress, add_row, start_table
 from torchrl_pref.training.sessions import Sessions
 
 OF_EPISODES = {
-    "train/alignment": ("metrics", "alignment"),
+    "train/alignment": "alignment",
     "train/episode_length": "step_count",
     "train/reward": "episode_reward",
 }

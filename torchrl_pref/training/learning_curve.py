@@ -18,6 +18,7 @@ from torchrl_pref.build import Settings, Task, make_policy, make_training_env
 from torchrl_pref.checkpoints.checkpoint import picks_by_index
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
+from torchrl_pref.envs.session import is_feed
 from torchrl_pref.evaluation.comparison import check_evaluation
 from torchrl_pref.evaluation.run import draw_humans, evaluate
 from torchrl_pref.policies.base import Policy
@@ -87,7 +88,7 @@ class LearningCurve:
     def _baseline(self) -> tuple[str, TensorDictModuleBase]:
         """The strongest strategy that learns nothing, by the name that reports know it by."""
         env, _, _ = self._made
-        if isinstance(env, FeedEnv):
+        if is_feed(env):
             return "quantile", QuantileAsk(env, alignment_gain)
         return "greedy alignment", Greedy(self.task.response_model, alignment_gain)
 

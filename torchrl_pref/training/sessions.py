@@ -10,10 +10,10 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_pref.envs.feed import FeedEnv
-from torchrl_pref.envs.query import QueryEnv
+from torchrl_pref.envs.objectives import alignment
 from torchrl_pref.policies.base import Policy
 
 
@@ -33,7 +33,7 @@ class Sessions:
             steps (``step_count``) that each has had.
     """
 
-    def __init__(self, env: QueryEnv | FeedEnv, policy: Policy, steps: int) -> None:
+    def __init__(self, env: EnvBase, policy: Policy, steps: int) -> None:
         self.env, self.policy, self.steps = env, policy, steps
         self.strategy = policy.strategy
         self.kept = {*policy.actor.in_keys, *policy.value.in_keys, "action", "n_asked"}
@@ -78,7 +78,7 @@ class Sessions:
         total = session["episode_reward"] + after["reward"]
         count = session["step_count"] + 1
         kept = {key: after[key] for key in ("reward", "done", "terminated", "n_asked")}
-        kept["metrics"] = after["metrics"].select("alignment")
+        kept["alignment"] = alignment(after["session", "samples"], session["human", "omega"])
         record["next"] = TensorDict(
             {**kept, "episode_reward": total, "step_count": count}, self.env.batch_size
         )

@@ -29,6 +29,7 @@ ORDER = [
     "evaluation",
     "training",
     "pretrained",
+    "session",
     "sweeps",
 ]
 """Folders and modules of the package, from the ground up: each may use those before it."""

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from torchrl_pref.questions.choice import Choice
     from torchrl_pref.questions.responses import Boltzmann, Optimal, ResponseModel
     from torchrl_pref.questions.weak import Weak
+    from torchrl_pref.session import Session
     from torchrl_pref.tasks.gridworld import gridworld_pool
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     "QueryEnv",
     "QueryPool",
     "ResponseModel",
+    "Session",
     "SimulatedHuman",
     "Weak",
     "alignment",
@@ -48,6 +50,7 @@ _MODULES = {
     "questions.choice": ("Choice",),
     "questions.responses": ("Boltzmann", "Optimal", "ResponseModel"),
     "questions.weak": ("Weak",),
+    "session": ("Session",),
     "tasks.gridworld": ("gridworld_pool",),
 }
 _HOME = {name: module for module, names in _MODULES.items() for name in names}

@@ -9,6 +9,7 @@ through the same ``env.rollout``.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from tensordict import TensorDictBase
@@ -16,7 +17,12 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Generator, Tensor
 from torchrl.envs import EnvBase
 
-from torchrl_pref.acquisition.functions import Acquisition, information_gain
+from torchrl_pref.acquisition.functions import (
+    Acquisition,
+    alignment_gain,
+    information_gain,
+    volume_removal,
+)
 from torchrl_pref.acquisition.scoring import moments_among, predict_answers, score_queries, together
 from torchrl_pref.beliefs.per_belief import PerBelief
 from torchrl_pref.envs.transition import OPEN
@@ -267,3 +273,16 @@ class OfferRank:
 def asks_over_offers(n_asked: Tensor, n_offered: Tensor, budget: int, n_offers: int) -> Tensor:
     """Asks left over offers left, at most 1, from counts (B 1)."""
     return ((budget - n_asked) / (n_offers - n_offered).clamp(min=1)).clamp(max=1)
+
+
+MakeStrategy = Callable[[EnvBase], TensorDictModuleBase]
+"""From an environment to what asks in it."""
+
+STRATEGIES: dict[str, MakeStrategy] = {
+    "random": lambda env: RandomQuery(),
+    "information_gain": lambda env: Greedy(env.belief.response_model, information_gain),
+    "alignment_gain": lambda env: Greedy(env.belief.response_model, alignment_gain),
+    "volume_removal": lambda env: Greedy(env.belief.response_model, volume_removal),
+    "lookahead": lambda env: Lookahead(env.belief.response_model),
+}
+"""Strategies that choose from candidates, by name."""

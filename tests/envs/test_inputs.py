@@ -237,7 +237,7 @@ def test_a_belief_and_a_human_have_a_response_model(model: Any) -> None:
     ("place", "value", "message"),
     [
         (0, torch.rand(9, 2, 3), "pool of type Tensor: expected a QueryPool"),
-        (1, MODEL, "human of type Boltzmann: expected a SimulatedHuman"),
+        (1, MODEL, "human of type Boltzmann: expected a HumanBase, such as SimulatedHuman"),
         (1, None, "human of type NoneType"),
         (2, MODEL, "belief of type Boltzmann: expected a Belief"),
         (2, SimulatedHuman(MODEL), "belief of type SimulatedHuman"),

@@ -167,7 +167,7 @@ def test_sessions_of_every_kind(
     env = kind(pool, SimulatedHuman(model), Belief(model, 40), 8, batch_size=(50,))
     after = env.rollout(40, break_when_any_done=False)["next"]
     assert after["samples"].isfinite().all()
-    answers = after["history", "answers"]
+    answers = after["session", "history", "answers"]
     assert set(answers.unique().tolist()) == set(range(-1, model.n_answers(n_options)))
 
 

@@ -187,6 +187,11 @@ class SessionEnv(EnvBase):
             "remaining": 1 - n_asked / self.budget,
         }
 
+    def show(self, session: Session) -> TensorDict:
+        """What a strategy sees of sessions (B) that somebody else keeps, as a live person's."""
+        shown = {**self._shown(session, {}), "session": session}
+        return TensorDict(shown, self.batch_size, device=self.device)
+
     def _put_on_table(self, shown: dict[str, Tensor], begun: Tensor | None) -> None:
         """Tell random actions what is shown now, in all sessions or where they began (B 1)."""
 

@@ -143,6 +143,11 @@ class ResponseModel(ABC):
         return len(self.question.answers(n_options).labels)
 
     @property
+    def is_soft(self) -> bool:
+        """Whether every answer is possible, however bad."""
+        return True
+
+    @property
     def is_plain(self) -> bool:
         """Whether the question is a choice, answered without lapses: closed forms are for this."""
         return not self.lapse and type(self.question) is Choice
@@ -273,6 +278,11 @@ class Optimal(ResponseModel):
     def __init__(self, tolerance: float = 1e-6, lapse: float = 0.0) -> None:
         self.tolerance = check_not_negative("tolerance", tolerance)
         self.lapse = _check_lapse(lapse)
+
+    @property
+    def is_soft(self) -> bool:
+        """See :meth:`ResponseModel.is_soft`."""
+        return bool(self.lapse)
 
     def log_likelihood(self, gaps: Tensor) -> Tensor:
         """See :meth:`ResponseModel.log_likelihood`."""

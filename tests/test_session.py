@@ -1,0 +1,194 @@
+"""Ask and tell, as somebody uses it who knows neither TorchRL nor the environments."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+import torch
+from torch import Generator
+
+from torchrl_pref import Boltzmann, Normalizer, Optimal, QueryPool, Session, Weak, gridworld_pool
+from torchrl_pref.beliefs.sampled import Belief
+from torchrl_pref.errors import InputError
+from torchrl_pref.humans.simulated import SimulatedHuman
+from torchrl_pref.strategies import STRATEGIES, RandomQuery
+
+MODEL = Boltzmann(3.0)
+
+
+def converse(session: Session, omega: torch.Tensor, turns: int) -> list[int]:
+    """Ask, and answer by the higher reward; the queries that were asked."""
+    asked = []
+    for _ in range(turns):
+        question = session.ask()
+        asked.append(int(question.query))
+        session.tell(int((question.features @ omega).argmax()))
+    return asked
+
+
+@pytest.mark.parametrize("strategy", [*STRATEGIES, "policy", lambda env: RandomQuery(7)])
+@pytest.mark.parametrize("model", [MODEL, Optimal()], ids=str)
+def test_what_a_person_wants_is_found(strategy: Any, model: Any, generator: Generator) -> None:
+    features = torch.randn(300, 2, 4, generator=generator)
+    session = Session(features, model, strategy, budget=10)
+    omega = torch.tensor([0.5, -0.5, 0.5, 0.5])
+    converse(session, omega, 10)
+    assert session.n_answered == 10
+    weights = session.weights
+    assert weights.mean.shape == (4,)
+    assert (weights.low < weights.mean).all()
+    assert (weights.mean < weights.high).all()
+    assert torch.cosine_similarity(weights.mean, omega, dim=0) > 0.7
+    mean, sd = session.score(features[:50, 0])
+    assert torch.corrcoef(torch.stack([mean, features[:50, 0] @ omega]))[0, 1] > 0.7
+    assert (sd > 0).all()
+    with pytest.raises(InputError, match="budget=10: all questions are answered"):
+        session.ask()
+
+
+@pytest.mark.parametrize("strategy", ["alignment_gain", "random", "policy"])
+@pytest.mark.parametrize("at", [0, 3, 6])
+def test_it_goes_on_bit_for_bit_from_json(strategy: str, at: int, generator: Generator) -> None:
+    pool = QueryPool(torch.randn(100, 2, 5, generator=generator))
+    omega = torch.randn(5, generator=generator)
+    whole = Session(pool, MODEL, strategy, budget=9, seed=4)
+    asked = converse(whole, omega, 9)
+    first = Session(pool, MODEL, strategy, budget=9, seed=4)
+    assert converse(first, omega, at) == asked[:at]
+    if at:
+        first.ask()  # a question that is open
+    text = json.dumps(first.to_dict())
+    second = Session.from_dict(json.loads(text), pool, MODEL, strategy)
+    assert converse(second, omega, 9 - at) == asked[at:]
+    assert torch.equal(second.samples, whole.samples)
+    assert second.to_dict() == whole.to_dict()
+
+
+def test_undo_takes_back_and_asks_again(generator: Generator) -> None:
+    features = torch.randn(60, 2, 4, generator=generator)
+    session, straight = (Session(features, MODEL, seed=2) for _ in range(2))
+    omega = torch.tensor([1.0, 0.0, 0.0, 0.0])
+    converse(session, omega, 3)
+    before = session.samples
+    question = session.ask()
+    slip = int((question.features @ omega).argmin())
+    session.tell(slip)
+    session.undo()
+    assert torch.equal(session.samples, before)
+    assert session.ask().query == question.query
+    converse(session, omega, 2)
+    converse(straight, omega, 5)
+    assert torch.equal(session.samples, straight.samples)
+    for _ in range(5):
+        session.undo()
+    with pytest.raises(InputError, match="nothing to undo"):
+        session.undo()
+
+
+def test_people_side_by_side_are_as_each_alone(generator: Generator) -> None:
+    """Their questions and answers, that is; their luck is not the same."""
+    features = torch.randn(50, 2, 3, generator=generator)
+    session = Session(features, MODEL, "volume_removal", people=3, budget=6)
+    for turn in range(6):
+        question = session.ask()
+        assert question.features.shape == (3, 2, 3)
+        session.tell([0, 1, None if turn == 2 else 0])
+    assert session.weights.mean.shape == (3, 3)
+    assert session.score(features[:7, 0])[0].shape == (3, 7)
+    session.undo()
+    with pytest.raises(InputError, match="one for each of 3 people"):
+        session.tell(0)
+
+
+def test_no_answer_teaches_nothing(generator: Generator) -> None:
+    session = Session(torch.randn(50, 2, 3, generator=generator), MODEL)
+    before = session.samples
+    session.ask()
+    session.tell(None)
+    assert session.n_answered == 1
+    assert torch.equal(session.samples, before)
+
+
+def test_other_kinds_of_question(generator: Generator) -> None:
+    session = Session(torch.randn(50, 2, 3, generator=generator), Boltzmann(3.0, Weak(0.5)))
+    session.ask()
+    session.tell(2)  # about equal
+    session.ask()
+    with pytest.raises(InputError, match="answer=3: expected a whole number from 0 to 2"):
+        session.tell(3)
+
+
+@pytest.mark.parametrize("answer", [2, -1, 0.0, True, "0", [0], torch.tensor(0)])
+def test_what_is_no_answer_changes_nothing(answer: Any, generator: Generator) -> None:
+    session = Session(torch.randn(50, 2, 3, generator=generator), MODEL)
+    with pytest.raises(InputError, match=r"expected ask\(\) before tell\(\)"):
+        session.tell(0)
+    question, before = session.ask(), session.samples
+    with pytest.raises(InputError):
+        session.tell(answer)
+    assert session.ask().query == question.query
+    assert torch.equal(session.samples, before)
+    assert session.n_answered == 0
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        {"format": 2},
+        {"answers": [[0], [7]]},
+        {"answers": [[0]]},
+        {"queries": [[1], [99]]},
+        {"queries": [[1, 2], [3, 4]]},
+        {"queries": "import os"},
+        {"seed": "0"},
+        {"budget": 1},
+        {"pool": "0" * 64},
+        {"samples": 50},
+        {"response_model": "Boltzmann(tau=4)"},
+        {"asked": [50]},
+    ],
+)
+def test_spoiled_sessions_are_refused(spoil: dict[str, Any], generator: Generator) -> None:
+    features = torch.randn(50, 2, 3, generator=generator)
+    session = Session(features, MODEL)
+    converse(session, torch.ones(3), 2)
+    with pytest.raises(InputError) as error:
+        Session.from_dict({**session.to_dict(), **spoil}, features, MODEL)
+    assert "\n" not in str(error.value)
+
+
+def test_raw_features_are_normalised_where_the_session_knows_how() -> None:
+    raw = gridworld_pool(40)
+    normalizer = Normalizer.fit(raw.features)
+    pool = raw.map_features(normalizer)
+    told = Session(pool, MODEL, normalizer=normalizer)
+    assert told.ask().trajectories is not None
+    plain = Session(pool, MODEL)
+    found, _ = told.score(raw.features[:, 0])
+    expected, _ = plain.score(pool.features[:, 0])
+    assert torch.allclose(found, expected, atol=1e-5)
+
+
+def test_it_aligns_as_the_environment_does(generator: Generator) -> None:
+    """Thirty simulated people at once, as well as thirty in an environment would."""
+    features = torch.randn(200, 2, 4, generator=generator)
+    people, human = 30, SimulatedHuman(MODEL)
+    drawn = human.draw(people, 12, 2, 4, generator)
+    session = Session(features, MODEL, people=people, budget=12, belief=Belief(MODEL, 60))
+    for turn in range(12):
+        answers = human.respond(session.ask().features, drawn, torch.full((people,), turn))
+        session.tell(answers.tolist())
+    cosines = torch.einsum("bmd,bd->bm", session.samples, drawn["omega"])
+    assert 0.8 < float(cosines.mean()) < 0.97
+
+
+def test_importing_it_takes_neither_collectors_nor_plotting() -> None:
+    heavy = ("torchrl.collectors", "matplotlib", "hydra", "tensorboard")
+    code = "import sys; from torchrl_pref import Session; "
+    code += f"print([name for name in {heavy!r} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -1,0 +1,338 @@
+"""Ask and tell: questions for live people, without an environment of your own.
+
+Shapes: B people, M belief samples, N queries in the pool, K options per query, D features, H
+questions that are planned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torch import Generator, Tensor
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torchrl_pref.beliefs.base import BeliefBase
+from torchrl_pref.beliefs.sampled import Belief
+from torchrl_pref.envs.query import QueryEnv
+from torchrl_pref.envs.transition import REFUSED, begin, tell
+from torchrl_pref.errors import InputError, check_choice, check_count, check_seed, check_type
+from torchrl_pref.humans.simulated import SimulatedHuman
+from torchrl_pref.pool import Normalizer, QueryPool
+from torchrl_pref.questions.responses import ResponseModel
+from torchrl_pref.strategies import STRATEGIES, MakeStrategy
+
+FORMAT = 1
+"""Of what :meth:`Session.to_dict` makes."""
+
+PRIME = 1_000_003
+"""Between the seeds of two sessions there is room for so many answers."""
+
+
+class Asked(NamedTuple):
+    """A question to show; with one person the leading B is left out."""
+
+    query: Tensor
+    """(B), its index in the pool."""
+    features: Tensor
+    """(B K D), of its options, as in the pool."""
+    trajectories: Tensor | None
+    """(B K …), what the person is shown, where the pool has it."""
+
+
+class Weights(NamedTuple):
+    """What is known of the weights; with one person the leading B is left out."""
+
+    mean: Tensor
+    """(B D), mean of the samples."""
+    sd: Tensor
+    """(B D), their standard deviation."""
+    low: Tensor
+    """(B D), below it lie 5% of the samples."""
+    high: Tensor
+    """(B D), above it lie 5%."""
+
+
+class Session:
+    """Questions and answers of one person, or of B side by side, and what is known of them.
+
+    >>> session = Session(pool, Boltzmann(2.0))
+    >>> asked = session.ask()
+    >>> session.tell(0)  # the first option
+    >>> session.weights.mean
+
+    Everything follows from the seed and the answers: the same answers give the same questions and
+    the same belief, bit for bit.
+
+    Args:
+        pool: the queries, normalised; or their features (N K D).
+        response_model: how the person is thought to answer; also says what can be answered.
+        strategy: a name of ``strategies.STRATEGIES``; ``policy``, the trained one that comes with
+            the package; or a function from a ``QueryEnv`` to a module that writes ``action``.
+        belief: how answers become a belief; by default samples.
+        budget: H, questions that are planned, and the most that can be asked.
+        people: B; None is one person, and nothing has a leading B.
+        normalizer: what the pool was normalised by, for :meth:`score` to apply to raw features.
+        seed: fixes all luck.
+
+    Raises:
+        InputError: something is not what it should be.
+    """
+
+    def __init__(
+        self,
+        pool: QueryPool | Tensor,
+        response_model: ResponseModel,
+        strategy: str | MakeStrategy = "alignment_gain",
+        belief: BeliefBase | None = None,
+        budget: int = 20,
+        people: int | None = None,
+        normalizer: Normalizer | None = None,
+        seed: int = 0,
+    ) -> None:
+        check_type("response_model", response_model, ResponseModel, "Boltzmann(2.0)")
+        self.pool = QueryPool(pool) if isinstance(pool, Tensor) else pool
+        self.budget, self.seed = check_count("budget", budget, 1), check_seed("seed", seed)
+        self.people = None if people is None else check_count("people", people, 1)
+        self.normalizer = normalizer
+        belief = Belief(response_model) if belief is None else belief
+        human = SimulatedHuman(belief.response_model)  # nobody whom it asks
+        size = (1 if people is None else people,)
+        self._env = QueryEnv(self.pool, human, belief, budget, batch_size=size, seed=seed)
+        self._strategy = _made(strategy, self._env)
+        samples = belief.prior(size[0], self.pool.n_features, Generator().manual_seed(self.seed))
+        self._states = [begin(samples, budget, self.pool.n_options)]
+        self._told: list[tuple[Tensor, Tensor]] = []
+        self._asked: Tensor | None = None
+
+    @property
+    def n_answered(self) -> int:
+        """Answers so far, of each person; one that was refused counts."""
+        return len(self._states) - 1
+
+    @torch.no_grad()
+    def ask(self) -> Asked:
+        """The question to answer next, the same until it is answered.
+
+        Raises:
+            InputError: the budget is used up.
+        """
+        if self.n_answered >= self.budget:
+            raise InputError(
+                f"budget={self.budget}: all questions are answered; expected a larger budget where "
+                "more are to be asked"
+            )
+        if self._asked is None:
+            for module in self._strategy.modules():
+                if isinstance(getattr(module, "generator", None), Generator):
+                    module.generator.manual_seed(self._luck)
+            shown = self._env.show(self._states[-1])
+            with set_exploration_type(ExplorationType.DETERMINISTIC):
+                self._asked = self._strategy(shown)["action"]
+        index, shown_to = self._asked, self.pool.trajectories
+        trajectories = None if shown_to is None else self._plain(shown_to[index])
+        return Asked(self._plain(index), self._plain(self.pool.features[index]), trajectories)
+
+    def tell(self, answer: int | Sequence[int | None] | None) -> None:
+        """Let in the answer to the question that :meth:`ask` gave.
+
+        Args:
+            answer: its number among the answers that the question has, from 0 on (of a choice: the
+                option), or None where the person would not say; for B people one each.
+
+        Raises:
+            InputError: nothing was asked, or there is no such answer. Nothing has changed then.
+        """
+        if self._asked is None:
+            raise InputError("an answer to no question: expected ask() before tell()")
+        given = [answer] if self.people is None else answer
+        if not isinstance(given, Sequence) or len(given) != len(self._asked):
+            raise InputError(
+                f"answer={answer!r}: expected one for each of {len(self._asked)} people"
+            )
+        last = self._env.belief.response_model.n_answers(self.pool.n_options) - 1
+        for one in given:
+            if one is not None and (type(one) is not int or not 0 <= one <= last):
+                raise InputError(
+                    f"answer={one!r}: expected a whole number from 0 to {last}, or None where the "
+                    "person would not say"
+                )
+        answers = torch.tensor([REFUSED if one is None else one for one in given])
+        self._let_in(self._asked, answers)
+
+    def undo(self) -> None:
+        """Take the last answer back; its question is asked again.
+
+        Raises:
+            InputError: there is none.
+        """
+        if not self.n_answered:
+            raise InputError("nothing to undo: expected at least one answer")
+        self._states.pop()
+        self._asked, _ = self._told.pop()
+
+    @property
+    def samples(self) -> Tensor:
+        """(B M D), the belief's."""
+        return self._plain(self._states[-1]["samples"])
+
+    @property
+    def weights(self) -> Weights:
+        """What is known of the weights."""
+        samples = self._states[-1]["samples"]
+        low, high = torch.quantile(samples, samples.new_tensor([0.05, 0.95]), dim=1)
+        numbers = samples.mean(1), samples.std(1), low, high
+        return Weights(*map(self._plain, numbers))
+
+    def score(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """The reward of trajectories, and how sure that is.
+
+        Args:
+            features: (n D), raw where the session knows the normaliser, else normalised.
+
+        Returns:
+            (B n) and (B n), mean and standard deviation over the samples.
+        """
+        if self.normalizer is not None:
+            features = self.normalizer(features)
+        if features.ndim != 2 or features.shape[-1] != self.pool.n_features:
+            raise InputError(
+                f"features of shape {tuple(features.shape)}: expected (n, {self.pool.n_features})"
+            )
+        rewards = self._states[-1]["samples"] @ features.mT
+        return self._plain(rewards.mean(1)), self._plain(rewards.std(1))
+
+    def to_dict(self) -> dict[str, Any]:
+        """All that :meth:`from_dict` needs to go on, as plain JSON."""
+        return {
+            "format": FORMAT,
+            "pool": self.pool.digest,
+            "response_model": repr(self._env.belief.response_model),
+            "samples": self._env.belief.n_samples,
+            "budget": self.budget,
+            "people": self.people,
+            "seed": self.seed,
+            "queries": [index.tolist() for index, _ in self._told],
+            "answers": [answers.tolist() for _, answers in self._told],
+            "asked": None if self._asked is None else self._asked.tolist(),
+        }
+
+    @classmethod
+    def from_dict(
+        cls,
+        content: dict[str, Any],
+        pool: QueryPool | Tensor,
+        response_model: ResponseModel,
+        strategy: str | MakeStrategy = "alignment_gain",
+        belief: BeliefBase | None = None,
+        normalizer: Normalizer | None = None,
+    ) -> Session:
+        """Go on where :meth:`to_dict` was taken, bit for bit: all answers are let in again.
+
+        Args:
+            content: what it made; numbers alone, no code.
+            pool, response_model, strategy, belief, normalizer: as the session was made with.
+
+        Raises:
+            InputError: the content is spoiled, or was made with another pool or belief.
+        """
+        check_content(content)
+        budget, people, seed = (content[key] for key in ("budget", "people", "seed"))
+        session = cls(pool, response_model, strategy, belief, budget, people, normalizer, seed)
+        made_with = session.to_dict()
+        for key in ("pool", "response_model", "samples"):
+            if content[key] != made_with[key]:
+                raise InputError(
+                    f"{key}: the session was made with {content[key]!s:.80}, and this is "
+                    f"{made_with[key]!s:.80}; expected the same"
+                )
+        for queries, answers in zip(content["queries"], content["answers"], strict=True):
+            session._let_in(session._index_of(queries), torch.tensor(answers))
+        if content["asked"] is not None:
+            session._asked = session._index_of(content["asked"])
+        return session
+
+    @property
+    def _luck(self) -> int:
+        """The seed of the present turn."""
+        return self.seed * PRIME + self.n_answered
+
+    def _let_in(self, index: Tensor, answers: Tensor) -> None:
+        """Add answers (B) to pool queries (B) to the belief."""
+        options, generator = self.pool.features[index], Generator().manual_seed(self._luck)
+        belief = self._env.belief
+        after = tell(belief, self._states[-1], options, answers, index, generator)
+        self._states.append(after)
+        self._told.append((index, answers))
+        self._asked = None
+
+    def _index_of(self, queries: list[int]) -> Tensor:
+        """(B), queries of the pool.
+
+        Raises:
+            InputError: one is not of the pool, or there are not B.
+        """
+        size = self._env.batch_size.numel()
+        if len(queries) != size or not all(0 <= query < len(self.pool) for query in queries):
+            raise InputError(f"queries {queries!s:.80}: expected {size} of the {len(self.pool)}")
+        return torch.tensor(queries)
+
+    def _plain(self, tensor: Tensor) -> Tensor:
+        """Without the leading B where there is one person."""
+        return tensor[0] if self.people is None else tensor
+
+
+def _made(strategy: str | MakeStrategy, env: QueryEnv) -> TensorDictModuleBase:
+    """What asks, in an environment."""
+    if strategy == "policy":
+        from torchrl_pref.pretrained import pretrained_policy  # and all that it takes
+
+        kind = "noisy" if env.belief.response_model.is_soft else "optimal"
+        return pretrained_policy(env, kind).strategy
+    if isinstance(strategy, str):
+        return STRATEGIES[check_choice("strategy", strategy, (*STRATEGIES, "policy"))](env)
+    if not callable(strategy) or isinstance(strategy, TensorDictModuleBase):
+        raise InputError(
+            f"strategy of type {type(strategy).__name__}: expected a function from an environment "
+            "to a module that writes action, such as lambda env: Greedy(env.belief.response_model)"
+        )
+    return strategy(env)
+
+
+def check_content(content: Any) -> None:
+    """Refuse what :meth:`Session.to_dict` did not make.
+
+    Raises:
+        InputError: a part is missing or no plain number.
+    """
+
+    def numbers(rows: Any) -> bool:
+        return isinstance(rows, list) and all(type(one) is int for one in rows)
+
+    def turns(rows: Any) -> bool:
+        return isinstance(rows, list) and all(map(numbers, rows))
+
+    checks = {
+        "format": lambda value: value == FORMAT,
+        "pool": lambda value: isinstance(value, str),
+        "response_model": lambda value: isinstance(value, str),
+        "samples": lambda value: type(value) is int,
+        "budget": lambda value: type(value) is int,
+        "people": lambda value: value is None or type(value) is int,
+        "seed": lambda value: type(value) is int,
+        "queries": turns,
+        "answers": turns,
+        "asked": lambda value: value is None or numbers(value),
+    }
+    if not isinstance(content, dict):
+        raise InputError(f"a session of type {type(content).__name__}: expected a dict")
+    for key, fits in checks.items():
+        if key not in content or not fits(content[key]):
+            raise InputError(
+                f"{key} of a session is {content.get(key, 'missing')!s:.60}: expected what "
+                f"Session.to_dict() makes, in its format {FORMAT}"
+            )
+    if len(content["queries"]) != len(content["answers"]):
+        raise InputError("a session with a query too many or an answer: expected as many of each")

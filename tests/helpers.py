@@ -17,8 +17,8 @@ from torchrl_pref.humans.simulated import SimulatedHuman
 from torchrl_pref.pool import QueryPool
 from torchrl_pref.questions.responses import ResponseModel
 from torchrl_pref.strategies import RandomAsk, RandomQuery
-from torchrl_pref.training.a2c import Trainer
 from torchrl_pref.training.start import make_trainer
+from torchrl_pref.training.trainer import Trainer
 
 ENVS = [QueryEnv, FeedEnv]
 
@@ -58,7 +58,9 @@ def settings_of(setup: str = "feed", policy: str = "scorer", **training: Any) ->
         "grid": {"size": 8, "length": 20},
         "pool": {"size": 30, "options": 2, "seed": 0, "train": None, "test": None},
         "belief": {"samples": 10, "moves": 1},
-        "evaluation": {"humans": 5, "seed": 1},
+        "logger": ["csv"],
+        "algorithm": {"name": "a2c"},
+        "evaluation": {"humans": 5, "seed": 1, "during": 0},
         "policy": {"name": policy, "sample": False, "start": None, "tokens": "samples"},
         "setup": {
             "name": setup,

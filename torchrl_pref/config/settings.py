@@ -17,6 +17,7 @@ from torchrl_pref.config.checks import (
     LARGEST_THREADS,
     Check,
     check_device,
+    check_loggers,
     check_path,
     check_spread,
     check_tau,
@@ -63,6 +64,7 @@ TASK: dict[str, Check] = {
 TRAINING: dict[str, Check] = {
     "tau": check_tau,
     "seed": check_seed,
+    "logger": check_loggers,
     "evaluation.during": count(0),
     "training.updates": count(1),
     "training.sessions": count(1),
@@ -112,10 +114,23 @@ POLICIES: dict[str, dict[str, Check]] = {
     },
     "paper": {"policy.sample": check_flag},
 }
+ALGORITHMS: dict[str, dict[str, Check]] = {
+    "a2c": {},
+    "ppo": {
+        "algorithm.clip_epsilon": positive(1.0),
+        "algorithm.epochs": count(1),
+        "algorithm.minibatches": count(1),
+    },
+}
 PRETRAINED: dict[str, dict[str, Check]] = {"pretrained": {}}
 """The policies that evaluate.py can be asked for by name."""
 
-SECTIONS = ("grid", "pool", "belief", "evaluation", "training", "setup", "policy")
+Groups = Mapping[str, Mapping[str, Mapping[str, Check]]]
+"""By group, and by the name that chooses from it, the checks of its keys."""
+
+OF_TRAINING: Groups = {"setup": SETUPS, "policy": POLICIES, "algorithm": ALGORITHMS}
+
+SECTIONS = ("grid", "pool", "belief", "evaluation", "training", "setup", "policy", "algorithm")
 
 
 def check_train_settings(settings: Settings) -> None:
@@ -124,7 +139,7 @@ def check_train_settings(settings: Settings) -> None:
     Raises:
         InputError: a key is missing, unknown or out of its range, or two do not go together.
     """
-    _check_keys(settings, TASK | TRAINING | TRAIN_DOOR, POLICIES)
+    _check_keys(settings, TASK | TRAINING | TRAIN_DOOR, OF_TRAINING)
     check_run(settings)
 
 
@@ -135,7 +150,7 @@ def check_run(settings: Settings) -> None:
         InputError: a key is missing, unknown or out of its range, or two do not go together.
     """
     own = {key: value for key, value in settings.items() if key not in (*TRAIN_DOOR, "overrides")}
-    _check_keys(own, TASK | TRAINING, POLICIES)
+    _check_keys(own, TASK | TRAINING, OF_TRAINING)
     _check_together(own)
     setup, policy = own["setup"], own["policy"]
     if setup["name"] == "feed" and policy.get("start") is not None:
@@ -152,16 +167,17 @@ def check_evaluate_settings(settings: Settings) -> None:
     Raises:
         InputError: a key is missing, unknown or out of its range, or two do not go together.
     """
-    _check_keys(settings, TASK | EVALUATE, PRETRAINED if "policy" in settings else {})
+    groups: Groups = {"setup": SETUPS}
+    if "policy" in settings:
+        groups = {"setup": SETUPS, "policy": PRETRAINED}
+    _check_keys(settings, TASK | EVALUATE, groups)
     _check_together(settings)
     if "policy" in settings:
         one_or_more(choice("noisy", "optimal"))("tau", settings["tau"])
     check_memory(settings)
 
 
-def _check_keys(
-    settings: Settings, table: Mapping[str, Check], policies: Mapping[str, Mapping[str, Check]]
-) -> None:
+def _check_keys(settings: Settings, table: Mapping[str, Check], groups: Groups) -> None:
     """Hold every key to its check, and the keys to the table and to the chosen groups' own."""
     for section in SECTIONS:
         if not isinstance(settings.get(section, {}), dict):
@@ -170,9 +186,8 @@ def _check_keys(
                 f"type {section}.<key>=<value>, --help lists them"
             )
     checks = dict(table)
-    for group, tables in (("setup", SETUPS), ("policy", policies)):
-        if tables:
-            checks |= _group_checks(settings, group, tables)
+    for group, tables in groups.items():
+        checks |= _group_checks(settings, group, tables)
     given = _flat(settings)
     for key in given:
         if key not in checks:
@@ -189,7 +204,7 @@ def _check_keys(
 def _group_checks(
     settings: Settings, group: str, tables: Mapping[str, Mapping[str, Check]]
 ) -> dict[str, Check]:
-    """The checks of the setup or of the policy that is chosen."""
+    """The checks of what is chosen from a group."""
     options = " or ".join(f"{group}={name}" for name in tables)
     if "name" not in settings.get(group, {}):
         raise InputError(f"{group} is missing: expected one; type {options}")
@@ -211,7 +226,7 @@ def _flat(settings: Settings) -> dict[str, Any]:
 
 def _chosen(settings: Settings) -> str:
     """The groups that decide which keys there are."""
-    groups = {group: settings.get(group, {}).get("name") for group in ("setup", "policy")}
+    groups = {group: settings.get(group, {}).get("name") for group in OF_TRAINING}
     return " and ".join(f"{group}={name}" for group, name in groups.items() if name is not None)
 
 

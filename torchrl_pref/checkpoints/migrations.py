@@ -1,0 +1,51 @@
+"""What files of earlier versions lack, added where they are read: the one place that knows of it.
+
+Each function takes what may be of any version, or spoiled, and changes it in place. What it cannot
+make sense of it leaves to the checks that follow. Applied twice, it does what it does once.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+ADDED_CURVES = (
+    "train/actor_loss",
+    "train/critic_loss",
+    "train/entropy",
+    "train/gradient_norm",
+    "train/learning_rate",
+    "train/share_asked",
+)
+"""Measured of each update since format 5."""
+
+
+def migrate(settings: Any) -> None:
+    """Add the keys that settings of earlier versions lack, with what these versions did.
+
+    Args:
+        settings: of a checkpoint, or of a run's ``config.yaml``.
+    """
+    if not isinstance(settings, dict):
+        return
+    # Version 0.1.0 evaluated nothing while it trained; up to format 4 there was A2C alone.
+    if isinstance(settings.get("evaluation"), dict):
+        settings["evaluation"].setdefault("during", 0)
+    settings.setdefault("algorithm", {"name": "a2c"})
+    settings.setdefault("logger", ["csv", "tensorboard"])
+
+
+def migrate_training(training: Any) -> None:
+    """Add what the ``training`` of earlier checkpoints lacks; what was not measured is NaN."""
+    if not isinstance(training, dict) or not isinstance(training.get("history"), dict):
+        return
+    history = training["history"]
+    rewards = history.get("train/reward")
+    if not isinstance(rewards, list):
+        return
+    for name in ADDED_CURVES:
+        history.setdefault(name, [math.nan] * len(rewards))
+    # Policies of version 0.1.0 were saved without these.
+    training.setdefault("update", len(rewards))
+    training.setdefault("held_out", {})
+    training.setdefault("baseline", None)

@@ -16,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 import app
 import typed
 from torchrl_pref import runs, sweeps
+from torchrl_pref.checkpoints.migrations import migrate
 from torchrl_pref.config.memory import check_memory
 from torchrl_pref.config.settings import check_run, check_train_settings
 from torchrl_pref.errors import InputError
@@ -25,13 +26,17 @@ from torchrl_pref.storage.writing import write_text
 if TYPE_CHECKING:
     from torchrl_pref.build import Task
     from torchrl_pref.checkpoints.checkpoint import Checkpoint
-    from torchrl_pref.training.a2c import Trainer
+    from torchrl_pref.training.trainer import Trainer
 
 CONFIG = "config.yaml"
 POOLS = ("train_pool.pt", "test_pool.pt")
 RUN = (CHECKPOINT, *POOLS, CONFIG)
 """The files by which a folder holds a run. The configuration comes first: from it the run can be
 started again where it was killed before its first checkpoint."""
+
+
+OF_THE_MACHINE = ("device", "threads", "logger")
+"""Settings that leave a run what it is, and may differ where it goes on."""
 
 
 @hydra.main(config_path="conf", config_name="train", version_base="1.3")
@@ -51,7 +56,7 @@ def check(settings: dict[str, Any]) -> None:
     app.check_groups(settings)
     if settings["resume"] is not None:
         own = tuple(group for group in typed.GROUPS if typed.was_typed(f"{group}.make"))
-        allowed = ("training.updates", "device", "threads", "hydra.")
+        allowed = ("training.updates", *OF_THE_MACHINE, "hydra.")
         typed.refuse_other_overrides("resume", allowed, own)
 
 
@@ -114,7 +119,7 @@ def refuse_other_run(folder: Path, settings: dict[str, Any]) -> None:
     differing = [
         f"{key}={there.get(key)} there and {asked.get(key)} here"
         for key in sorted(asked.keys() | there.keys())
-        if asked.get(key) != there.get(key) and key not in ("device", "threads")
+        if asked.get(key) != there.get(key) and key not in OF_THE_MACHINE
     ]
     if differing:
         raise InputError(
@@ -145,6 +150,7 @@ def load_config(folder: Path) -> dict[str, Any]:
         raise InputError(f"{folder / CONFIG}: cannot be read ({error}); restore it") from error
     if not isinstance(settings, dict):
         raise InputError(f"{folder / CONFIG}: holds no settings; restore it")
+    migrate(settings)
     return {str(key): value for key, value in settings.items()}
 
 
@@ -191,9 +197,7 @@ def go_on(folder: Path, new: dict[str, Any]) -> float:
 
     checkpoint = Checkpoint.load(folder) if (folder / CHECKPOINT).exists() else None
     settings = load_config(folder) if checkpoint is None else checkpoint.settings
-    if isinstance(settings.get("evaluation"), dict):
-        settings["evaluation"].setdefault("during", 0)  # version 0.1.0 knew no such key
-    for key in ("device", "threads"):
+    for key in OF_THE_MACHINE:
         if typed.was_typed(key):
             settings[key] = new[key]
     if typed.was_typed("training.updates"):
@@ -250,7 +254,8 @@ def train(folder: Path, settings: dict[str, Any], task: Task, trainer: Trainer) 
     def save() -> None:
         make_checkpoint(settings, task, trainer).save(folder / CHECKPOINT)
 
-    trainer.run(folder, save, LearningCurve(settings, task, trainer).measure)
+    measure = LearningCurve(settings, task, trainer).measure
+    trainer.run(folder, save, measure, settings["logger"])
     label = comparison.label_of(settings)
     learned = {label: make_checkpoint(settings, task, trainer)}
     panels = comparison.evaluate_panels(settings, task, learned)

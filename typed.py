@@ -162,7 +162,7 @@ def plain_settings(config: DictConfig) -> Settings:
     settings = OmegaConf.to_container(own, resolve=True)
     assert isinstance(settings, dict)
     choices = HydraConfig.get().runtime.choices
-    for group in ("setup", *GROUPS):
+    for group in ("setup", "algorithm", *GROUPS):
         section, chosen = settings.get(group), choices.get(group)
         name = section.get("name", chosen) if isinstance(section, dict) else chosen
         if isinstance(chosen, str) and name != chosen:

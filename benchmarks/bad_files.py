@@ -49,8 +49,8 @@ from torchrl_pref.errors import InputError, check_count
 from torchrl_pref.evaluation import comparison
 from torchrl_pref.pool import QueryPool
 from torchrl_pref.storage.files import MAX_FILE
-from torchrl_pref.training.a2c import Trainer
 from torchrl_pref.training.start import make_checkpoint, make_trainer
+from torchrl_pref.training.trainer import Trainer
 
 OUTCOMES = ("refused", "harmless", "accepted", "traceback", "hang", "crash", "memory", "executed")
 COLUMNS = ("tried", *OUTCOMES, "changed")

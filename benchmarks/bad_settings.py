@@ -185,6 +185,9 @@ ODD = {
         "objective=entropy belief.samples=3",
         "policy.start=alignment setup=feed",
         "policy.tokens=samples policy=scorer",
+        "algorithm.epochs=4 algorithm=a2c",
+        "algorithm=ppo algorithm.clip_epsilon=1.5",
+        "logger=[csv,wandb,csv]",
         "resume=. tau=1",
         "resume=. checkpoint=.",
         "pool.test=.",
@@ -231,10 +234,13 @@ class Result(NamedTuple):
 def keys_of(script: str) -> dict[str, tuple[Any, list[str]]]:
     """Every key with its default, and what chooses the groups that have it."""
     found: dict[str, tuple[Any, list[str]]] = {}
-    policies = ("scorer", "attention", "paper") if script == "train" else ("pretrained",)
+    choices = [["policy=pretrained"]]
+    if script == "train":
+        choices = [[f"policy={policy}"] for policy in ("scorer", "attention", "paper")]
+        choices = [[*chosen, f"algorithm={name}"] for chosen in choices for name in ("a2c", "ppo")]
     for setup in ("feed", "query"):
-        for policy in policies:
-            groups = [f"setup={setup}", f"policy={policy}"]
+        for chosen in choices:
+            groups = [f"setup={setup}", *chosen]
             with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
                 config = compose(script, groups)
             for key, value in _leaves(OmegaConf.to_container(config), ""):
@@ -254,7 +260,7 @@ def _leaves(node: Any, prefix: str) -> Iterator[tuple[str, Any]]:
 def commands_of(script: str) -> list[tuple[str, ...]]:
     """Distinct wrong command lines of a script."""
     made: list[Sequence[str]] = []
-    groups = ("setup", "policy", "experiment")
+    groups = ("setup", "policy", "algorithm", "experiment")
     keys = keys_of(script)
     for key, (default, chosen) in keys.items():
         numeric = isinstance(default, (int, float)) or default is None or key == "tau"
@@ -341,7 +347,7 @@ def _stop_at_work() -> None:
     """What is legal ends where it would start to train or to evaluate, on a machine of 4 GB."""
     from torchrl_pref.config import memory
     from torchrl_pref.evaluation import comparison, heldout
-    from torchrl_pref.training.a2c import Trainer
+    from torchrl_pref.training.trainer import Trainer
 
     def stop(*_: Any, **__: Any) -> None:
         os._exit(STARTED)

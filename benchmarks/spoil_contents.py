@@ -20,6 +20,7 @@ WRONG: dict[type, tuple[Any, ...]] = {
     float: ("much", None, math.nan, -math.inf, [], torch.ones(2)),
     str: (5, [], {}, "no such word", b"bytes"),
     type(None): ([], {"a": 1}, torch.ones(2)),
+    list: ("csv", None, 5, [5], {}, torch.ones(2)),
 }
 """What cannot stand where a value of this type does."""
 
@@ -41,8 +42,7 @@ def spoiled_settings(content: dict[str, Any]) -> Iterator[Case]:
             del at(content["settings"], place[:-1])[place[-1]]
 
         name = ".".join(place)
-        if name != "evaluation.during":  # version 0.1.0 wrote none
-            yield edited(content, "spoiled settings", f"without {name}", remove)
+        yield edited(content, "spoiled settings", f"without {name}", remove)
         for wrong in (5, "text", None, []) if isinstance(value, dict) else WRONG[type(value)]:
 
             def replace(
@@ -63,10 +63,7 @@ def spoiled_content(content: dict[str, Any]) -> Iterator[Case]:
                 content, "spoiled content", name, lambda c, k=key, w=wrong: c.update({k: w})
             )
     for key in content["training"]:
-        if key not in ("held_out", "baseline"):  # version 0.1.0 wrote neither
-            yield edited(
-                content, "spoiled content", f"no {key}", lambda c, k=key: c["training"].pop(k)
-            )
+        yield edited(content, "spoiled content", f"no {key}", lambda c, k=key: c["training"].pop(k))
         for wrong in ("text", -1, [1], {"a": "b"}, torch.ones(3), b"bytes"):
             name = f"training.{key}={str(wrong)[:20]}"
             yield edited(

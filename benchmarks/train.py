@@ -39,7 +39,9 @@ from torchrl_pref.humans.simulated import SimulatedHuman
 from torchrl_pref.policies.paper import paper_policy
 from torchrl_pref.questions.responses import Boltzmann
 from torchrl_pref.strategies import RandomAsk
-from torchrl_pref.training.a2c import A2CSettings, Trainer
+from torchrl_pref.training.a2c import A2C
+from torchrl_pref.training.settings import TrainingSettings
+from torchrl_pref.training.trainer import Trainer
 
 COUNTS = (1, 8, 64, 256)
 PAPER = Path(__file__).parents[1] / "conf" / "experiment" / "paper.yaml"
@@ -62,7 +64,8 @@ class Ours:
         constants = {**OmegaConf.load(PAPER).training, "sessions": n_envs, "steps": STEPS}
         env = make_env(n_envs)
         torch.manual_seed(0)
-        self.trainer = Trainer(env, paper_policy(env), A2CSettings(**constants), seed=0)
+        algorithm = A2C(paper_policy(env), TrainingSettings(**constants))
+        self.trainer = Trainer(env, algorithm, seed=0)
 
     def advance(self, updates: int) -> list[int]:
         """Collect and update so often; the lengths of the sessions that ended meanwhile."""

@@ -20,8 +20,8 @@ from torchrl_pref.questions.base import Evidence
 from torchrl_pref.questions.choice import evidence_of_gaps
 from torchrl_pref.questions.responses import ResponseModel
 from torchrl_pref.strategies import RandomAsk, RandomQuery
-from torchrl_pref.training.a2c import Trainer
 from torchrl_pref.training.start import make_trainer
+from torchrl_pref.training.trainer import Trainer
 
 ENVS = [QueryEnv, FeedEnv]
 
@@ -69,7 +69,9 @@ def settings_of(setup: str = "feed", policy: str = "scorer", **training: Any) ->
         "task": {"name": "gridworld", "size": 8, "length": 20},
         "pool": {"size": 30, "options": 2, "seed": 0, "train": None, "test": None},
         "belief": {"name": "sampled", "samples": 10, "moves": 1, "lapse": 0.0},
-        "evaluation": {"humans": 5, "seed": 1},
+        "logger": ["csv"],
+        "algorithm": {"name": "a2c"},
+        "evaluation": {"humans": 5, "seed": 1, "during": 0},
         "policy": {"name": policy, "sample": False, **OF_POLICY[policy]},
         "setup": {
             "name": setup,

@@ -20,11 +20,11 @@ from torchrl_pref.evaluation.run import Evaluation, draw_humans, evaluate
 from torchrl_pref.evaluation.statistics import bootstrap_interval
 from torchrl_pref.pretrained import pretrained_checkpoint
 from torchrl_pref.strategies import Greedy, QuantileAsk
-from torchrl_pref.training.a2c import Trainer
 from torchrl_pref.training.figure import learned, write_training
 from torchrl_pref.training.learning_curve import LearningCurve
 from torchrl_pref.training.progress import Progress
 from torchrl_pref.training.start import make_checkpoint
+from torchrl_pref.training.trainer import Trainer
 
 
 def watched(

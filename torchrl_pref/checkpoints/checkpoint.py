@@ -10,7 +10,7 @@ from typing import Any
 from torch import Tensor
 
 from torchrl_pref.checkpoints.contents import check_content
-from torchrl_pref.checkpoints.migrations import MIGRATIONS, migrate
+from torchrl_pref.checkpoints.migrations import migrate, migrate_training
 from torchrl_pref.errors import InputError
 from torchrl_pref.policies import POLICIES
 from torchrl_pref.pool import Normalizer, QueryPool, save_atomically
@@ -20,7 +20,10 @@ from torchrl_pref.storage.files import load_safely
 KIND = "torchrl_pref checkpoint"
 
 FORMAT = 5
-"""Raised whenever a key of the settings or of the checkpoint changes its meaning or its name."""
+"""Raised whenever a key of the settings or of the checkpoint comes, goes or changes its meaning."""
+
+READABLE = (4, FORMAT)
+"""Formats that can be read, the older ones by :mod:`torchrl_pref.checkpoints.migrations`."""
 
 
 def picks_by_index(settings: dict[str, Any]) -> bool:
@@ -84,13 +87,14 @@ class Checkpoint:
         content.pop("kind")
         found = content.pop("format", None)
         version = found if type(found) is int and 0 <= found < 1000 else "unknown"
-        known = version == FORMAT or version in MIGRATIONS
-        if not known or set(content) != set(cls.__dataclass_fields__):
+        if version not in READABLE or set(content) != set(cls.__dataclass_fields__):
             raise InputError(
                 f"{path}: written by another version of this package (format {version}, expected "
-                f"{FORMAT}); train again, or use the version that wrote it"
+                f"{' or '.join(map(str, READABLE))}); train again, or use the version that wrote it"
             )
-        content = migrate(content, int(version))
+        if version != FORMAT:
+            migrate(content["settings"])
+            migrate_training(content["training"])
         try:
             check_content(content)
         except InputError as error:

@@ -30,6 +30,9 @@ TOP: dict[str, Types] = {
     "seed": WHOLE,
 }
 
+LISTS = ("overrides", "logger")
+"""Settings that are lists of texts."""
+
 SECTIONS: dict[str, dict[str, Types]] = {
     "task": {"name": TEXT},
     "question": {"name": TEXT},
@@ -40,7 +43,7 @@ SECTIONS: dict[str, dict[str, Types]] = {
     },
     "belief": {"name": TEXT, "lapse": NUMBER},
     "policy": {"name": TEXT, "sample": FLAG},
-    "evaluation": {"humans": WHOLE, "seed": WHOLE},
+    "evaluation": {"humans": WHOLE, "seed": WHOLE, "during": WHOLE},
     "training": {
         **dict.fromkeys(("updates", "sessions", "critic_steps", "warm_up", "save_every"), WHOLE),
         **dict.fromkeys(("learning_rate", "gamma", "lmbda", "entropy", "critic"), NUMBER),
@@ -55,10 +58,30 @@ SETUPS: dict[str, dict[str, Types]] = {
     "feed": {"budget": WHOLE, "offers": WHOLE + NONE, "on_skip": TEXT},
 }
 
-CURVES = ("train/alignment", "train/episode_length", "train/reward")
-"""What figures are made of; a history may have more."""
+ALGORITHMS: dict[str, dict[str, Types]] = {
+    "a2c": {},
+    "ppo": {"clip_epsilon": NUMBER, "epochs": WHOLE, "minibatches": WHOLE},
+}
 
-TRAINING = ("update", "weights", "optimizer", "sessions", "env_generator", "global_generator")
+CURVES = (
+    "train/alignment",
+    "train/episode_length",
+    "train/reward",
+    "train/explained_variance",
+    "train/actor_loss",
+    "train/critic_loss",
+    "train/entropy",
+    "train/gradient_norm",
+    "train/learning_rate",
+    "train/share_asked",
+    "time/frames_per_second",
+)
+"""What is measured of each update; a history may have more."""
+
+KNOWN = ("update", "history", "held_out", "baseline")
+"""How a training went, of every policy."""
+
+TRAINING = ("weights", "optimizer", "sessions", "env_generator", "global_generator")
 """What training goes on from; a policy that is only used has none of it."""
 
 
@@ -110,7 +133,7 @@ def check_weights(name: str, weights: Any) -> None:
 
 def _check_settings(settings: Any) -> None:
     _expect(isinstance(settings, dict), "settings", "a dict")
-    named = {"setup": SETUPS}
+    named = {"setup": SETUPS, "algorithm": ALGORITHMS}
     for section, known in named.items():
         value = settings.get(section)
         name = value.get("name") if isinstance(value, dict) else None
@@ -119,10 +142,11 @@ def _check_settings(settings: Any) -> None:
         _check_types(f"settings.{section}", value, known[name])
     for section, keys in SECTIONS.items():
         _check_types(f"settings.{section}", settings.get(section), keys)
-    _check_types("settings", settings, TOP, (*SECTIONS, *named, "overrides"))
-    overrides = settings.get("overrides")
-    fits = type(overrides) is list and all(type(typed) is str for typed in overrides)
-    _expect(fits, "settings.overrides", "a list of texts")
+    _check_types("settings", settings, TOP, (*SECTIONS, *named, *LISTS))
+    for name in LISTS:
+        texts = settings.get(name)
+        fits = type(texts) is list and all(type(text) is str for text in texts)
+        _expect(fits, f"settings.{name}", "a list of texts")
 
 
 def _check_types(
@@ -150,13 +174,15 @@ def _check_training(training: Any) -> None:
         _expect(fits, "training.history", "lists of numbers")
     lengths = {len(values) for values in history.values()}
     _expect(len(lengths) <= 1, "training.history", "lists of one length")
-    _check_held_out(training.get("held_out", {}), training.get("baseline"))
-    if set(training) <= {"history", "update", "held_out", "baseline"}:
+    for name in KNOWN:
+        _expect(name in training, f"training.{name}", "how the training went")
+    update = training["update"]
+    _expect(type(update) is int and lengths == {update}, "training.update", "the history's length")
+    _check_held_out(training["held_out"], training["baseline"])
+    if set(training) == set(KNOWN):
         return
     for name in TRAINING:
         _expect(name in training, f"training.{name}", "the state of the training")
-    update = training["update"]
-    _expect(type(update) is int and lengths == {update}, "training.update", "the history's length")
     check_weights("training.weights", training["weights"])
     optimizer = training["optimizer"]
     fits = isinstance(optimizer, dict) and isinstance(optimizer.get("state"), dict)

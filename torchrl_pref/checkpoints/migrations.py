@@ -1,36 +1,38 @@
-"""Checkpoints of earlier formats, brought up to date when they are read.
+"""What files of earlier versions lack, added where they are read: the one place that knows of it.
 
-A format is raised whenever a key of the settings or of the checkpoint changes its meaning or name.
+Each function takes what may be of any version, or spoiled, and changes it in place. What it cannot
+make sense of it leaves to the checks that follow. Applied twice, it does what it does once.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
 from typing import Any
 
-Content = dict[str, Any]
+ADDED_CURVES = (
+    "train/actor_loss",
+    "train/critic_loss",
+    "train/entropy",
+    "train/gradient_norm",
+    "train/learning_rate",
+    "train/share_asked",
+)
+"""Measured of each update since format 5."""
 
 
-def migrate(content: Content, version: int) -> Content:
-    """What a checkpoint of a version holds, as the present one would say it.
+def migrate(settings: Any) -> None:
+    """Add the keys that settings of earlier versions lack, with what these versions did.
 
     Args:
-        content: of the file; where it is not what the version wrote, it stays as it is, to be
-            refused by whoever checks it.
-        version: one of ``MIGRATIONS``.
+        settings: of a checkpoint, or of a run's ``config.yaml``.
     """
-    settings = content.get("settings")
-    if isinstance(settings, dict):
-        migrated = dict(settings)
-        for step in sorted(MIGRATIONS):
-            if step >= version:
-                MIGRATIONS[step](migrated)
-        return {**content, "settings": migrated}
-    return content
-
-
-def _groups(settings: Content) -> None:
-    """From 4 to 5: the task, the question, the human and the belief are chosen by name."""
+    if not isinstance(settings, dict):
+        return
+    # Version 0.1.0 evaluated nothing while it trained; up to format 4 there was A2C alone.
+    if isinstance(settings.get("evaluation"), dict):
+        settings["evaluation"].setdefault("during", 0)
+    settings.setdefault("algorithm", {"name": "a2c"})
+    # Up to format 4 there was one task, one question, one kind of human and one of belief.
     if "grid" in settings:
         grid = settings.pop("grid")
         settings["task"] = {"name": "gridworld", **(grid if isinstance(grid, dict) else {})}
@@ -39,7 +41,20 @@ def _groups(settings: Content) -> None:
     settings.setdefault("question", {"name": "choice"})
     if isinstance(settings.get("belief"), dict):
         settings["belief"] = {"name": "sampled", "lapse": 0.0, **settings["belief"]}
+    settings.setdefault("logger", ["csv", "tensorboard"])
 
 
-MIGRATIONS: dict[int, Callable[[Content], None]] = {4: _groups}
-"""By the format that it takes settings from, what makes them those of the next."""
+def migrate_training(training: Any) -> None:
+    """Add what the ``training`` of earlier checkpoints lacks; what was not measured is NaN."""
+    if not isinstance(training, dict) or not isinstance(training.get("history"), dict):
+        return
+    history = training["history"]
+    rewards = history.get("train/reward")
+    if not isinstance(rewards, list):
+        return
+    for name in ADDED_CURVES:
+        history.setdefault(name, [math.nan] * len(rewards))
+    # Policies of version 0.1.0 were saved without these.
+    training.setdefault("update", len(rewards))
+    training.setdefault("held_out", {})
+    training.setdefault("baseline", None)

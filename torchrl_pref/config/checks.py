@@ -9,6 +9,7 @@ import os
 import re
 from collections.abc import Callable
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,10 @@ Check = Callable[[str, Any], object]
 LARGEST_COUNT = 2**53
 LARGEST_TAU = 1e6
 LARGEST_THREADS = max(64, os.cpu_count() or 1)
+
+LOGGERS = ("csv", "tensorboard", "wandb", "mlflow")
+EXTRAS = ("wandb", "mlflow")
+"""Loggers whose packages are extras, of the same names."""
 
 
 def check_tau(name: str, value: Any) -> None:
@@ -91,6 +96,29 @@ def check_path(name: str, value: Any) -> None:
         found = False
     if not found:
         raise InputError(f"{name}={value}: no such file; check the path")
+
+
+def check_loggers(name: str, value: Any) -> None:
+    """Refuse what is no list of loggers, or one whose package is not installed.
+
+    Raises:
+        InputError: it is no list, names none or one twice, or a package is missing.
+    """
+    if not isinstance(value, list):
+        raise InputError(
+            f"{name}={value!r}: expected a list, such as {name}=[csv,tensorboard], or {name}=[] "
+            "for no logs"
+        )
+    if value:
+        one_or_more(choice(*LOGGERS))(name, value)
+    for package in [extra for extra in EXTRAS if extra in value]:
+        found = find_spec(package)
+        # A folder of that name, as wandb makes them, is found as a package without a file.
+        if found is None or found.origin is None:
+            raise InputError(
+                f"{name}: {package} is not installed; install it by "
+                f"pip install -c constraints.txt -e '.[{package}]', or leave {package} out"
+            )
 
 
 def optional(check: Check) -> Check:

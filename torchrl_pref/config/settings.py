@@ -17,6 +17,7 @@ from torchrl_pref.config.checks import (
     LARGEST_THREADS,
     Check,
     check_device,
+    check_loggers,
     check_path,
     check_spread,
     check_tau,
@@ -60,6 +61,7 @@ TASK: dict[str, Check] = {
 TRAINING: dict[str, Check] = {
     "tau": check_tau,
     "seed": check_seed,
+    "logger": check_loggers,
     "evaluation.during": count(0),
     "training.updates": count(1),
     "training.sessions": count(1),
@@ -109,6 +111,14 @@ POLICIES: dict[str, dict[str, Check]] = {
     },
     "paper": {"policy.sample": check_flag},
 }
+ALGORITHMS: dict[str, dict[str, Check]] = {
+    "a2c": {},
+    "ppo": {
+        "algorithm.clip_epsilon": positive(1.0),
+        "algorithm.epochs": count(1),
+        "algorithm.minibatches": count(1),
+    },
+}
 OTHERS: dict[str, dict[str, dict[str, Check]]] = {
     "task": {
         "gridworld": {
@@ -125,7 +135,17 @@ OTHERS: dict[str, dict[str, dict[str, Check]]] = {
 PRETRAINED: dict[str, dict[str, Check]] = {"pretrained": {}}
 """The policies that evaluate.py can be asked for by name."""
 
-SECTIONS = ("pool", "evaluation", "training", "setup", "policy", *OTHERS)
+Groups = Mapping[str, Mapping[str, Mapping[str, Check]]]
+"""By group, and by the name that chooses from it, the checks of its keys."""
+
+OF_TRAINING: Groups = {
+    "setup": SETUPS,
+    "policy": POLICIES,
+    "algorithm": ALGORITHMS,
+    **OTHERS,
+}
+
+SECTIONS = ("pool", "evaluation", "training", "setup", "policy", "algorithm", *OTHERS)
 
 
 def check_train_settings(settings: Settings) -> None:
@@ -134,7 +154,7 @@ def check_train_settings(settings: Settings) -> None:
     Raises:
         InputError: a key is missing, unknown or out of its range, or two do not go together.
     """
-    _check_keys(settings, TASK | TRAINING | TRAIN_DOOR, POLICIES)
+    _check_keys(settings, TASK | TRAINING | TRAIN_DOOR, OF_TRAINING)
     check_run(settings)
 
 
@@ -145,7 +165,7 @@ def check_run(settings: Settings) -> None:
         InputError: a key is missing, unknown or out of its range, or two do not go together.
     """
     own = {key: value for key, value in settings.items() if key not in (*TRAIN_DOOR, "overrides")}
-    _check_keys(own, TASK | TRAINING, POLICIES)
+    _check_keys(own, TASK | TRAINING, OF_TRAINING)
     _check_together(own)
     setup, policy = own["setup"], own["policy"]
     if setup["name"] == "feed" and policy.get("start") is not None:
@@ -162,16 +182,17 @@ def check_evaluate_settings(settings: Settings) -> None:
     Raises:
         InputError: a key is missing, unknown or out of its range, or two do not go together.
     """
-    _check_keys(settings, TASK | EVALUATE, PRETRAINED if "policy" in settings else {})
+    groups: Groups = {"setup": SETUPS, **OTHERS}
+    if "policy" in settings:
+        groups = {**groups, "policy": PRETRAINED}
+    _check_keys(settings, TASK | EVALUATE, groups)
     _check_together(settings)
     if "policy" in settings:
         one_or_more(choice("noisy", "optimal"))("tau", settings["tau"])
     check_memory(settings)
 
 
-def _check_keys(
-    settings: Settings, table: Mapping[str, Check], policies: Mapping[str, Mapping[str, Check]]
-) -> None:
+def _check_keys(settings: Settings, table: Mapping[str, Check], groups: Groups) -> None:
     """Hold every key to its check, and the keys to the table and to the chosen groups' own."""
     for section in SECTIONS:
         if not isinstance(settings.get(section, {}), dict):
@@ -180,7 +201,6 @@ def _check_keys(
                 f"type {section}.<key>=<value>, --help lists them"
             )
     checks = dict(table)
-    groups = {"setup": SETUPS, **OTHERS, **({"policy": policies} if policies else {})}
     for group, tables in groups.items():
         checks |= _group_checks(settings, group, tables)
     given = _flat(settings)
@@ -240,7 +260,7 @@ def _flat(settings: Settings) -> dict[str, Any]:
 
 def _chosen(settings: Settings) -> str:
     """The groups that decide which keys there are."""
-    groups = {group: settings.get(group, {}).get("name") for group in ("setup", "policy")}
+    groups = {group: settings.get(group, {}).get("name") for group in OF_TRAINING}
     return " and ".join(f"{group}={name}" for group, name in groups.items() if name is not None)
 
 

@@ -182,7 +182,7 @@ def figure_2(histories: Mapping[str, Sequence[float]], path: Path) -> None:
     for name, values in histories.items():
         axis.plot(*smoothed(values, geometric_edges(len(values))), label=name)
     # Most of it happens in the first hundredth of the updates.
-    axis.set(xlabel="A2C updates", ylabel="training episode length (offers)", xscale="log")
+    axis.set(xlabel="policy updates", ylabel="training episode length (offers)", xscale="log")
     axis.grid(alpha=0.25)
     axis.legend(frameon=False)
     save_figure(figure, path)

@@ -23,7 +23,7 @@ from torchrl_pref.evaluation.comparison import check_evaluation
 from torchrl_pref.evaluation.run import draw_humans, evaluate
 from torchrl_pref.policies.base import Policy
 from torchrl_pref.strategies import Greedy, QuantileAsk
-from torchrl_pref.training.a2c import Trainer
+from torchrl_pref.training.trainer import Trainer
 
 HUMANS = 100
 """At most: all evaluations of a training together are to take a small part of its time."""
@@ -51,7 +51,7 @@ class LearningCurve:
 
     def __init__(self, settings: Settings, task: Task, trainer: Trainer) -> None:
         n_humans, _ = check_evaluation(settings)
-        self.times = settings["evaluation"].get("during", 0)  # version 0.1.0 knew no such key
+        self.times = settings["evaluation"]["during"]
         self.n_humans, self.seed = min(n_humans, HUMANS), LAST_SEED - settings["evaluation"]["seed"]
         self.settings, self.task, self.trainer = settings, task, trainer
 

@@ -13,18 +13,10 @@ from typing import Any, TextIO
 
 from torch import Tensor
 
+from torchrl_pref.checkpoints.contents import CURVES
 from torchrl_pref.errors import InputError
 from torchrl_pref.evaluation.statistics import bootstrap_interval
 from torchrl_pref.storage.writing import replacing
-
-METRICS = (
-    "train/alignment",
-    "train/episode_length",
-    "train/reward",
-    "train/explained_variance",
-    "time/frames_per_second",
-)
-"""What is told of each update."""
 
 HELD_OUT = ("held_out_alignment", "held_out_low", "held_out_high", "held_out_baseline")
 
@@ -35,23 +27,23 @@ class Progress:
 
     Attributes:
         update: updates done.
-        history: one value an update for each metric, NaN where no episode ended.
+        history: one value an update for each of ``CURVES``, NaN where there was nothing to measure.
         held_out: by update, 0 being the start, the alignment of the policy with each held-out human
             after the last query (B).
         baseline: the name of a strong strategy that learns nothing, and the same (B) of it.
     """
 
     update: int = 0
-    history: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in METRICS})
+    history: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in CURVES})
     held_out: dict[int, Tensor] = field(default_factory=dict)
     baseline: tuple[str, Tensor] | None = None
 
     @classmethod
     def of(cls, training: dict[str, Any]) -> Progress:
-        """What a checkpoint's ``training`` tells; version 0.1.0 knew no held-out humans."""
-        history = training["history"]
-        update = training.get("update", len(history["train/reward"]))
-        return cls(update, history, training.get("held_out", {}), training.get("baseline"))
+        """What a checkpoint's ``training`` tells."""
+        # In our order, whatever the order in the file.
+        history = {name: training["history"][name] for name in CURVES}
+        return cls(training["update"], history, training["held_out"], training["baseline"])
 
     def state_dict(self) -> dict[str, Any]:
         """Plain data and tensors that :meth:`of` reads."""

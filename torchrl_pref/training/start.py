@@ -4,29 +4,28 @@ from __future__ import annotations
 
 import torch
 
-from torchrl_pref.build import (
-    Settings,
-    Task,
-    make_policy,
-    make_training_env,
-)
+from torchrl_pref.build import Settings, Task, make_policy, make_training_env
 from torchrl_pref.checkpoints.checkpoint import Checkpoint
-from torchrl_pref.errors import check_seed
-from torchrl_pref.training.a2c import A2CSettings, Trainer
+from torchrl_pref.errors import check_choice, check_seed
+from torchrl_pref.training.algorithms import ALGORITHMS
+from torchrl_pref.training.settings import TrainingSettings
+from torchrl_pref.training.trainer import Trainer
 
 
 def make_trainer(settings: Settings, task: Task) -> Trainer:
-    """Environment, policy and A2C of a run, ready for its first update.
+    """Environment, policy and algorithm of a run, ready for its first update.
 
     Raises:
         InputError: a setting is out of range.
     """
-    a2c = A2CSettings(**settings["training"])
+    constants = TrainingSettings(**settings["training"])
+    own = dict(settings["algorithm"])
+    learn = ALGORITHMS[check_choice("algorithm", own.pop("name"), tuple(ALGORITHMS))]
     seed = check_seed("seed", settings["seed"])
-    env = make_training_env(settings, task, task.train, a2c.sessions, seed)
+    env = make_training_env(settings, task, task.train, constants.sessions, seed)
     # The policy's initial weights come from the global generator.
     torch.manual_seed(seed)
-    return Trainer(env, make_policy(settings, env), a2c, seed)
+    return Trainer(env, learn(make_policy(settings, env), constants, **own), seed)
 
 
 def make_checkpoint(settings: Settings, task: Task, trainer: Trainer) -> Checkpoint:

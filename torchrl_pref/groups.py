@@ -72,6 +72,16 @@ def make(group: str, section: Mapping[str, Any], *given: Any, without: tuple[str
         raise InputError(f"{group}.{error}" if first in keys else str(error)) from None
 
 
+def keys_of(group: str, name: str) -> list[str]:
+    """The settings of what a table holds under a name; of what it does not hold, none."""
+    constructor = TABLES[group].get(name)
+    if constructor is None:
+        return []
+    # The first argument is what it is made for: an environment, or a response model.
+    first = 1 if group in ("policy", "human", "belief") else 0
+    return list(inspect.signature(constructor).parameters)[first:]
+
+
 def find(group: str, section: Mapping[str, Any]) -> Callable[..., Any]:
     """The class or function that a section chooses.
 

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from torchrl_pref.errors import InputError
+from torchrl_pref.groups import TABLES, keys_of
 from torchrl_pref.storage.files import is_dense
 
 WHOLE, NUMBER, TEXT, FLAG = (int,), (int, float), (str,), (bool,)
@@ -142,6 +143,9 @@ def _check_settings(settings: Any) -> None:
         _check_types(f"settings.{section}", value, known[name])
     for section, keys in SECTIONS.items():
         _check_types(f"settings.{section}", settings.get(section), keys)
+    for group in TABLES:
+        for key in keys_of(group, settings[group]["name"]):
+            _expect(key in settings[group], f"settings.{group}.{key}", "a value")
     _check_types("settings", settings, TOP, (*SECTIONS, *named, *LISTS))
     for name in LISTS:
         texts = settings.get(name)

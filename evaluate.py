@@ -25,6 +25,7 @@ from torchrl_pref.runs import CHECKPOINT
 
 if TYPE_CHECKING:
     from torchrl_pref.checkpoints.checkpoint import Checkpoint
+    from torchrl_pref.evaluation.own import Maker
     from torchrl_pref.evaluation.records import Records
     from torchrl_pref.training.figure import Training
 
@@ -36,11 +37,14 @@ PROTOCOL_KEYS = (
     "hydra.",
     "setup.budget",
     "setup.offers",
+    "strategy",
     "belief.",
     "grid.",
     "pool.size",
     "pool.options",
     "pool.seed",
+    "pool.train",
+    "pool.test",
 )
 """What may be typed beside ``protocol``; the rest is the protocol's own."""
 
@@ -82,9 +86,10 @@ def check(settings: dict[str, Any]) -> None:
                 "policy=pretrained and checkpoint=… name two policies; expected one of "
                 "them; pretrained policies are files too: checkpoint=[a.pt,b.pt]"
             )
-        allowed = ("evaluation.", "pool.test", "device", "threads", "hydra.")
+        allowed = ("evaluation.", "pool.test", "strategy", "device", "threads", "hydra.")
         typed.refuse_other_overrides("checkpoint", allowed)
     check_evaluate_settings(settings)
+    own_strategies(settings)
 
 
 def evaluate(settings: dict[str, Any], folder: Path) -> None:
@@ -112,6 +117,19 @@ def listed(value: Any) -> list[Any]:
     return value if isinstance(value, list) else [value]
 
 
+def own_strategies(settings: dict[str, Any]) -> dict[str, Maker]:
+    """What makes the strategies that the user typed.
+
+    Raises:
+        InputError: there is no such module or name, or it cannot be called.
+    """
+    if settings["strategy"] is None:
+        return {}
+    from torchrl_pref.evaluation.own import find_makers
+
+    return find_makers(listed(settings["strategy"]))
+
+
 def evaluate_taus(
     settings: dict[str, Any], learned_for: Callable[[Any], dict[str, Checkpoint]]
 ) -> Records:
@@ -123,9 +141,11 @@ def evaluate_taus(
     pools = build.make_pools(settings)
     taus = listed(settings["tau"])
     tasks = [(build.make_task(*pools, tau), learned_for(tau)) for tau in taus]
-    records = Records()
+    own, records = own_strategies(settings), Records()
+    for task, _ in tasks:
+        comparison.try_strategies(own, settings, task)
     for task, learned in tasks:
-        records.entries += comparison.evaluate_task(settings, task, learned).entries
+        records.entries += comparison.evaluate_task(settings, task, learned, own=own).entries
     return records
 
 
@@ -158,7 +178,9 @@ def run_heldout(settings: dict[str, Any]) -> Records:
             checkpoint = Checkpoint.load(path)
             cell = Cell(checkpoint.settings["setup"]["name"], checkpoint.settings["tau"])
             learned.setdefault(cell, []).append(checkpoint)
-    return heldout.run_protocol(settings, learned, settings["workers"])
+    return heldout.run_protocol(
+        settings, learned, settings["workers"], list(own_strategies(settings))
+    )
 
 
 def find_checkpoints(named: list[str]) -> list[Path]:
@@ -204,12 +226,15 @@ def evaluate_checkpoints(
         named = path.parent if path.name == CHECKPOINT else path.with_suffix("")
         name = str(named.relative_to(common))
         runs.append((name, checkpoint, build.reload_task(checkpoint, *pools)))
+    own, groups = own_strategies(settings), comparison.group_checkpoints(runs)
+    for its_settings, task, _ in groups:
+        comparison.try_strategies(own, its_settings, task)
     records, trained = Records(), []
-    for own, task, learned in comparison.group_checkpoints(runs):
+    for its_settings, task, learned in groups:
         test = None
         if settings["pool"]["test"] is not None:
             test = QueryPool.load(settings["pool"]["test"]).map_features(task.normalizer)
-        records.entries += comparison.evaluate_task(own, task, learned, test).entries
+        records.entries += comparison.evaluate_task(its_settings, task, learned, test, own).entries
         for key, checkpoint in learned.items():
             trained.append(Training(key, task.title, Progress.of(checkpoint.training)))
     return records, trained

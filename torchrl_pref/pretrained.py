@@ -51,11 +51,6 @@ def pretrained_policy(env: QueryEnv | FeedEnv, tau: str, seed: int = 0) -> Polic
         InputError: there is no such policy, or the feed's skips are not free.
     """
     setup = "feed" if isinstance(env, FeedEnv) else "query"
-    if isinstance(env, FeedEnv) and env.skip != "free":
-        raise InputError(
-            f"skip={env.skip!r}: a pretrained feed policy was trained with free skips and a budget "
-            'of asks; make the environment with skip="free"'
-        )
     return load_policy(pretrained_checkpoint(setup, tau, seed), env)
 
 

@@ -16,6 +16,7 @@ from torchrl_pref.config.memory import check_memory
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.errors import InputError, check_count, check_flag, check_seed
+from torchrl_pref.evaluation.own import Maker, make_own, try_own
 from torchrl_pref.evaluation.records import Records, entry_of
 from torchrl_pref.evaluation.run import CURVES, Evaluation, draw_humans, evaluate
 from torchrl_pref.evaluation.side_by_side import Entrant
@@ -36,7 +37,11 @@ def policy_key(settings: Settings) -> str:
 
 
 def evaluate_task(
-    settings: Settings, task: Task, learned: Mapping[str, Checkpoint], test: QueryPool | None = None
+    settings: Settings,
+    task: Task,
+    learned: Mapping[str, Checkpoint],
+    test: QueryPool | None = None,
+    own: Mapping[str, Maker] | None = None,
 ) -> Records:
     """Compare strategies on the held-out pool.
 
@@ -49,6 +54,7 @@ def evaluate_task(
         task: the pools and the response model.
         learned: checkpoints to evaluate, by key.
         test: another held-out pool, normalised; by default the task's.
+        own: what makes the strategies of the user.
     """
     pools = {HELD_OUT: task.test if test is None else test}
     evaluated = {key: value for key, value in settings.items() if key != "training"}
@@ -58,7 +64,7 @@ def evaluate_task(
     records = Records()
     for name, pool in pools.items():
         title = task.title if len(pools) == 1 else f"{task.title}, {name} pool"
-        for key, result in compare(settings, task, pool, learned).items():
+        for key, result in compare(settings, task, pool, learned, own).items():
             seed = learned[key].settings["seed"] if key in learned else 0
             identity = {"protocol": "comparison", "task": title, "pool": name}
             records.entries.append(
@@ -81,7 +87,11 @@ def check_evaluation(settings: Settings) -> tuple[int, int]:
 
 
 def compare(
-    settings: Settings, task: Task, pool: QueryPool, learned: Mapping[str, Checkpoint]
+    settings: Settings,
+    task: Task,
+    pool: QueryPool,
+    learned: Mapping[str, Checkpoint],
+    own: Mapping[str, Maker] | None = None,
 ) -> dict[str, Evaluation]:
     """Baselines and learned policies on the same humans and luck.
 
@@ -92,10 +102,11 @@ def compare(
         task: gives the response model.
         pool: the queries, normalised.
         learned: checkpoints to evaluate, by key.
+        own: what makes the strategies of the user; they are made for the setup of the settings.
 
     Returns:
         By key: ``random``, ``greedy_information``, ``greedy_alignment``, for a feed also
-        ``ask_all`` and ``quantile_alignment``, and the learned ones.
+        ``ask_all`` and ``quantile_alignment``, the learned ones and those of the user.
     """
     n_humans, seed = check_evaluation(settings)
     humans = draw_humans(make_query_env(settings, task, pool, n_humans, seed))
@@ -115,6 +126,9 @@ def compare(
         env, policy = _load_policy(checkpoint, task, pool, n_humans, seed)
         sample = check_flag("policy.sample", checkpoint.settings["policy"]["sample"])
         runs.append((env, Entrant(key, policy.strategy, sample)))
+    if own:
+        env = _make_env(settings, task, pool, n_humans, seed)
+        runs += [(env, entrant) for entrant in make_own(own, env, seed)]
 
     results = {}
     for env, entrant in tqdm(runs, desc="evaluation", unit="strategy"):
@@ -130,9 +144,26 @@ def _load_policy(
     """A trained policy and the environment of its own setup on a pool."""
     checkpoint.check_fits(pool)
     settings = checkpoint.settings
-    make = make_feed_env if settings["setup"]["name"] == "feed" else make_query_env
-    env = make(settings, task, pool, n_humans, seed)
+    env = _make_env(settings, task, pool, n_humans, seed)
     return env, load_policy(checkpoint, env)
+
+
+def _make_env(
+    settings: Settings, task: Task, pool: QueryPool, n_humans: int, seed: int
+) -> QueryEnv | FeedEnv:
+    """The environment of the settings' setup, with all of a pool on the table."""
+    make = make_feed_env if settings["setup"]["name"] == "feed" else make_query_env
+    return make(settings, task, pool, n_humans, seed)
+
+
+def try_strategies(own: Mapping[str, Maker], settings: Settings, task: Task) -> None:
+    """Refuse strategies of the user that cannot decide in a task, before anything is run.
+
+    Raises:
+        InputError: one cannot be made, fails, or writes no action.
+    """
+    if own:
+        try_own(own, _make_env(settings, task, task.test, 2, 0))
 
 
 def _feed_of(checkpoint: Checkpoint) -> tuple[Any, Any] | None:

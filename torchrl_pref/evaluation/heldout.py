@@ -27,6 +27,7 @@ from torchrl_pref.evaluation.heldout_pool import (
     Job,
     fit_threshold,
     run_pool,
+    try_job,
 )
 from torchrl_pref.evaluation.records import Records
 
@@ -34,34 +35,37 @@ POOLS, BALANCED_POOLS = 10, 3
 
 
 def run_protocol(
-    settings: Settings, learned: Mapping[Cell, Sequence[Checkpoint]], workers: int
+    settings: Settings,
+    learned: Mapping[Cell, Sequence[Checkpoint]],
+    workers: int,
+    own: Sequence[str] = (),
 ) -> Records:
     """Run all cells for which there are policies.
+
+    On the Gridworld there are ten pools that no training used. On a pool of the user's
+    (``pool.train`` and ``pool.test``) ten groups of humans face the test pool, all of it: intervals
+    are over groups, and tell of other humans on that pool and not of other pools.
 
     Args:
         settings: the sections ``grid``, ``pool``, ``belief``, ``setup`` and ``device``.
         learned: the policies of each cell, of any kinds and training seeds.
         workers: processes that run pools side by side, one CPU thread each.
+        own: strategies of the user, ``module:name`` of each; they face every cell.
 
     Raises:
-        InputError: a policy was trained for another budget.
+        InputError: a policy was trained for another budget or cannot face the same offers as the
+            others, or a strategy of the user cannot decide.
     """
-    jobs = []
-    for cell, checkpoints in learned.items():
-        for checkpoint in checkpoints:
-            _check_fits(settings, cell, checkpoint, checkpoints[0])
-        kinds = kinds_of(checkpoints)
-        own = {**settings, "skip": checkpoints[0].settings["skip"]}
-        jobs += [Job(own, cell, pool, kinds) for pool in range(POOLS)]
-        if cell.setup == "query":
-            cell = cell._replace(features="balanced")
-            jobs += [Job(own, cell, pool, kinds) for pool in range(BALANCED_POOLS)]
+    jobs = _jobs(settings, learned, own)
+    for job in jobs:
+        if job.pool == 0:
+            try_job(job)
     # One file descriptor for each tensor that is passed would be too many for some systems.
     torch.multiprocessing.set_sharing_strategy("file_system")
     context = get_context("spawn")
     with ProcessPoolExecutor(workers, context, _start_worker) as executor:
         feeds = {job.cell: job for job in jobs if job.cell.setup == "feed" and job.pool == 0}
-        fits = [replace(job, learned={}, thresholds=THRESHOLDS) for job in feeds.values()]
+        fits = [replace(job, learned={}, own=(), thresholds=THRESHOLDS) for job in feeds.values()]
         alignments = executor.map(fit_threshold, fits)
         best = {
             cell: (THRESHOLDS[int(alignment.argmax())],)
@@ -70,6 +74,29 @@ def run_protocol(
         jobs = [replace(job, thresholds=best.get(job.cell, ())) for job in jobs]
         done = tqdm(executor.map(run_pool, jobs), total=len(jobs), desc="pools", unit="pool")
         return Records([entry for entries in done for entry in entries])
+
+
+def _jobs(
+    settings: Settings, learned: Mapping[Cell, Sequence[Checkpoint]], own: Sequence[str]
+) -> list[Job]:
+    """A job for each pool of each cell, whose thresholds are yet to be fitted."""
+    jobs = []
+    for cell, checkpoints in learned.items():
+        for checkpoint in checkpoints:
+            _check_fits(settings, cell, checkpoint, checkpoints[0])
+        kinds = kinds_of(checkpoints)
+        settings = {**settings, "skip": checkpoints[0].settings["skip"]}
+        cells = [(cell, POOLS)]
+        if settings["pool"]["test"] is not None:
+            cells = [(cell._replace(features="own"), POOLS)]
+        elif cell.setup == "query":
+            cells.append((cell._replace(features="balanced"), BALANCED_POOLS))
+        jobs += [
+            Job(settings, each, pool, kinds, own=own)
+            for each, count in cells
+            for pool in range(count)
+        ]
+    return jobs
 
 
 def _start_worker() -> None:

@@ -28,6 +28,7 @@ from torchrl_pref.checkpoints.checkpoint import Checkpoint
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.evaluation.comparison import FIRST_EVALUATION_SEED
+from torchrl_pref.evaluation.own import find_makers, make_own, try_own
 from torchrl_pref.evaluation.records import Entry, entry_of
 from torchrl_pref.evaluation.run import draw_humans
 from torchrl_pref.evaluation.side_by_side import Entrant, run_side_by_side
@@ -96,6 +97,7 @@ class Job:
         cell, pool: which; ``pool`` is a number.
         learned: the policies of each kind by key, one for each training seed.
         thresholds: in bits, of the feed's threshold rules.
+        own: strategies of the user, as typed.
     """
 
     settings: Settings
@@ -103,6 +105,7 @@ class Job:
     pool: int
     learned: Mapping[str, Sequence[Checkpoint]] = field(default_factory=dict)
     thresholds: Sequence[float] = ()
+    own: Sequence[str] = ()
 
 
 def task_and_pool(job: Job) -> tuple[Task, QueryPool]:
@@ -126,14 +129,10 @@ def run_pool(job: Job) -> list[Entry]:
     task, pool = task_and_pool(job)
     # A seed of its own for each pool.
     seed = FIRST_SEED + 1000 + job.pool
-    make = make_feed_env if job.cell.setup == "feed" else make_query_env
-
-    def make_env(sessions: int, settings: Settings = job.settings) -> QueryEnv | FeedEnv:
-        return make(settings, task, pool, sessions, seed)
-
+    make_env = partial(_make_env, job, task, pool, seed)
     env = make_env(HUMANS)
     humans = draw_humans(env)
-    judged = _judged(job, env)
+    judged = _judged(job, env, seed)
     lineup = [*_lineup(job, task, env, seed), *judged]
     torch.manual_seed(seed)  # of policies that draw their actions
     results = run_side_by_side(make_env, humans, lineup)
@@ -167,13 +166,40 @@ def run_pool(job: Job) -> list[Entry]:
     return entries
 
 
-def _judged(job: Job, env: QueryEnv | FeedEnv) -> list[Entrant]:
-    """The policies."""
-    return [
+def _make_env(
+    job: Job,
+    task: Task,
+    pool: QueryPool,
+    seed: int,
+    sessions: int,
+    settings: Settings | None = None,
+) -> QueryEnv | FeedEnv:
+    """The environment of a job; with other settings where they are given."""
+    make = make_feed_env if job.cell.setup == "feed" else make_query_env
+    return make(settings or job.settings, task, pool, sessions, seed)
+
+
+def try_job(job: Job) -> None:
+    """Refuse policies that do not fit a job's pool, and strategies of the user that cannot decide.
+
+    Raises:
+        InputError: there is one.
+    """
+    task, pool = task_and_pool(job)
+    env = _make_env(job, task, pool, 0, 2)
+    for one in (one for checkpoints in job.learned.values() for one in checkpoints):
+        load_policy(one, env)
+    try_own(find_makers(job.own), env)
+
+
+def _judged(job: Job, env: QueryEnv | FeedEnv, seed: int) -> list[Entrant]:
+    """The policies, and the strategies of the user."""
+    policies = [
         Entrant(key, load_policy(one, env).strategy, one.settings["policy"]["sample"])
         for key, checkpoints in job.learned.items()
         for one in checkpoints
     ]
+    return [*policies, *make_own(find_makers(job.own), env, seed)]
 
 
 def _lineup(job: Job, task: Task, env: QueryEnv | FeedEnv, seed: int) -> list[Entrant]:

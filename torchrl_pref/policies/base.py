@@ -44,15 +44,23 @@ class Policy:
 
     @property
     def strategy(self) -> TensorDictModuleBase:
-        """The whole policy, as the collector and the evaluation run it."""
-        if self.observe is None:
-            return self.actor
-        return TensorDictSequential(self.observe, self.actor)
+        """The whole policy, as the collector and the evaluation run it: it keeps no gradients."""
+        return Deciding(*(each for each in (self.observe, self.actor) if each is not None))
 
     @property
     def weights(self) -> nn.ModuleDict:
         """All that is learned, to be saved and loaded by its ``state_dict``."""
         return nn.ModuleDict({"actor": self.actor, "critic": self.critic})
+
+
+class Deciding(TensorDictSequential):
+    """Modules one after the other, of which only the decision is wanted: a rollout would otherwise
+    keep the graph of every step."""
+
+    @torch.no_grad()
+    def forward(self, *args: Any, **kwargs: Any) -> TensorDictBase:
+        """Write ``action`` (B), and what the modules write beside it."""
+        return super().forward(*args, **kwargs)
 
 
 class Layer(TensorDictModuleBase):

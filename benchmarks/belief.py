@@ -28,9 +28,11 @@ import torch
 from torch import Generator, Tensor
 
 from benchmarks import common, peers
+from benchmarks.common import told
 from torchrl_pref.acquisition.functions import information_gain
 from torchrl_pref.acquisition.scoring import score_queries
-from torchrl_pref.beliefs.sampled import Belief, feature_gaps, uniform_sphere
+from torchrl_pref.beliefs.sampled import Belief, uniform_sphere
+from torchrl_pref.questions.choice import feature_gaps
 from torchrl_pref.questions.responses import Boltzmann, Optimal, ResponseModel
 
 ANSWERS = (1, 5, 10, 20)
@@ -157,7 +159,7 @@ def _run_ours(model: ResponseModel, gaps: Tensor, repeats: int) -> dict[int, Mea
         def update(
             samples: Tensor = samples, ess: Tensor = ess, last: int = count - 1
         ) -> tuple[Tensor, Tensor, Tensor]:
-            return belief.update(samples, ess, shared[:, :last], shared[:, last], generator)
+            return belief.update(samples, ess, told(shared[:, :last], shared[:, last]), generator)
 
         samples, ess, _ = update()
         if count in ANSWERS:
@@ -230,7 +232,8 @@ def _quadrature(model: ResponseModel, gaps: Tensor) -> tuple[Tensor, Tensor]:
     sphere = torch.stack([theta.cos(), theta.sin() * phi.cos(), theta.sin() * phi.sin()], -1)
     for psi in half:
         points = torch.cat([psi.cos().expand(len(sphere), 1), psi.sin() * sphere], -1)
-        likelihood = model.joint_log_likelihood((points @ gaps[:, 0].double().T).unsqueeze(-1))
+        returns = (points @ gaps[:, 0].double().T)[..., None, None]
+        likelihood = model.joint_log_likelihood(returns, torch.zeros(1))
         weights = likelihood.exp() * psi.sin().square() * theta.sin()
         total += float(weights.sum())
         first += weights @ points

@@ -20,9 +20,11 @@ import torch
 from tabulate import tabulate
 from torch import Generator, Tensor
 
-from torchrl_pref.beliefs.sampled import Belief, feature_gaps, uniform_sphere
+from torchrl_pref.beliefs.sampled import Belief, uniform_sphere
 from torchrl_pref.compiled import share_out
 from torchrl_pref.pool import Normalizer, QueryPool
+from torchrl_pref.questions.base import Evidence
+from torchrl_pref.questions.choice import evidence_of_gaps, feature_gaps
 from torchrl_pref.questions.responses import ResponseModel
 from torchrl_pref.tasks.gridworld import gridworld_pool
 
@@ -91,7 +93,7 @@ def follow(
         answer = model(query @ omega).exp().multinomial(1, generator=generator)
         newest = feature_gaps(query[None], answer).expand(n_beliefs, -1, -1)
         start = time.process_time()
-        samples, ess, _ = belief.update(samples, ess, gaps, newest, generator)
+        samples, ess, _ = belief.update(samples, ess, told(gaps, newest), generator)
         seconds += time.process_time() - start
         gaps = torch.cat([gaps, newest.unsqueeze(1)], 1)
         variance = samples.double().flatten(0, 1).var(0).sum()
@@ -153,3 +155,8 @@ def belief_samples(n_sessions: int, n_samples: int = 100, n_features: int = 4) -
     """Samples (S M D) of the prior."""
     shape = (n_sessions, n_samples, n_features)
     return uniform_sphere(shape, torch.Generator().manual_seed(0))
+
+
+def told(earlier: Tensor, newest: Tensor) -> Evidence:
+    """The evidence of choices with feature gaps (S H K-1 D), and then one more (S K-1 D)."""
+    return evidence_of_gaps(torch.cat([earlier, newest.unsqueeze(1)], 1))

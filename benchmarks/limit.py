@@ -21,12 +21,14 @@ import torch
 from torch import Generator, Tensor
 
 from benchmarks import common
+from benchmarks.common import told
 from torchrl_pref.acquisition.functions import information_gain
 from torchrl_pref.acquisition.scoring import predict_answers, score_queries
 from torchrl_pref.beliefs.resampling import FRAMES, poles_of
-from torchrl_pref.beliefs.sampled import Belief, feature_gaps, uniform_sphere
+from torchrl_pref.beliefs.sampled import Belief, uniform_sphere
 from torchrl_pref.beliefs.slice import ARC, MAX_SHRINKS
 from torchrl_pref.beliefs.slice_cpu import compiled_moves
+from torchrl_pref.questions.choice import feature_gaps
 from torchrl_pref.questions.responses import Boltzmann, Optimal, ResponseModel, compiled_constants
 
 SESSIONS, MOVES = 100, 4
@@ -124,7 +126,7 @@ def _moving(model: ResponseModel, n_answers: int, repeats: int) -> common.Row:
         returns = (queries @ omega.unsqueeze(-1)).squeeze(-1)
         answers = model(returns).exp().multinomial(1, generator=generator).squeeze(-1)
         newest = feature_gaps(queries, answers)
-        samples, ess, _ = belief.update(samples, ess, gaps, newest, generator)
+        samples, ess, _ = belief.update(samples, ess, told(gaps, newest), generator)
         gaps = torch.cat([gaps, newest.unsqueeze(1)], 1)
     normal = torch.randn((SESSIONS, FRAMES, MOVES, pool.shape[-1]), generator=generator)
     slack, power = torch.zeros(SESSIONS), torch.ones(SESSIONS)
@@ -135,7 +137,9 @@ def _moving(model: ResponseModel, n_answers: int, repeats: int) -> common.Row:
     def step(shrinks: int = MAX_SHRINKS, moves: int = MOVES) -> Tensor:
         poles = poles_of(samples, normal[:, :, :moves])
         luck = uniform[:moves, ..., : 2 + shrinks]
-        return compiled_moves(samples, poles, luck, gaps, slack, power, ARC, *constants)
+        evidence = told(gaps[:, :-1], gaps[:, -1])
+        given = evidence.rows, evidence.offsets, evidence.floor, slack, power
+        return compiled_moves(samples, poles, luck, *given, ARC, *constants)
 
     # A sample that has not moved after so many shrinks needs one more evaluation.
     unmoved = sum((step(n, 1) - samples).norm(dim=-1) < 1e-6 for n in range(MAX_SHRINKS))

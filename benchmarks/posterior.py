@@ -30,10 +30,12 @@ from torch import Generator, Tensor
 from tqdm import tqdm
 
 from benchmarks import common
+from benchmarks.common import told
 from tests.posterior import Posterior, posterior
 from torchrl_pref.acquisition.functions import information_gain
 from torchrl_pref.acquisition.scoring import score_queries
-from torchrl_pref.beliefs.sampled import Belief, feature_gaps, uniform_sphere
+from torchrl_pref.beliefs.sampled import Belief, uniform_sphere
+from torchrl_pref.questions.choice import feature_gaps
 from torchrl_pref.questions.responses import Boltzmann, Optimal, ResponseModel
 
 BOUND = 0.02
@@ -162,7 +164,7 @@ def compare(
     start = time.process_time()
     for h in range(len(gaps)):
         earlier, newest = gaps[:h].expand(sessions, -1, -1, -1), gaps[h].expand(sessions, -1, -1)
-        samples, ess, _ = belief.update(samples, ess, earlier, newest, generator)
+        samples, ess, _ = belief.update(samples, ess, told(earlier, newest), generator)
     seconds = time.process_time() - start
     mean, total = torch.from_numpy(exact.mean), float(exact.covariance.trace())
     means = samples.double().mean(1)
@@ -208,7 +210,7 @@ def history(case: Case, seed: int = 0) -> Tensor:
             if likely[answer].isinf():
                 continue
         newest = feature_gaps(query[None], answer[None])
-        samples, ess, _ = belief.update(samples, ess, gaps, newest, generator)
+        samples, ess, _ = belief.update(samples, ess, told(gaps, newest), generator)
         gaps = torch.cat([gaps, newest[None]], 1)
     return gaps[0]
 

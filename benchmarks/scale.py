@@ -27,10 +27,21 @@ import matplotlib
 import torch
 from torch import Generator
 
-from benchmarks.common import TAU, Row, arguments, belief_samples, devices, paired, report, start
+from benchmarks.common import (
+    TAU,
+    Row,
+    arguments,
+    belief_samples,
+    devices,
+    paired,
+    report,
+    start,
+    told,
+)
 from torchrl_pref.acquisition.functions import information_gain
 from torchrl_pref.acquisition.scoring import score_queries
-from torchrl_pref.beliefs.sampled import Belief, feature_gaps, uniform_sphere
+from torchrl_pref.beliefs.sampled import Belief, uniform_sphere
+from torchrl_pref.questions.choice import feature_gaps
 from torchrl_pref.questions.responses import Boltzmann
 
 matplotlib.use("Agg")
@@ -103,13 +114,13 @@ def _prepare_update(point: Point, device: str) -> Callable[[], Any]:
     samples = belief.prior(n_sessions, point.D, generator)
     ess = torch.full((n_sessions,), float(n_samples))
     for j in range(point.H):
-        samples, ess, _ = belief.update(samples, ess, gaps[:, :j], gaps[:, j], generator)
+        samples, ess, _ = belief.update(samples, ess, told(gaps[:, :j], gaps[:, j]), generator)
 
     rows, columns = torch.arange(point.B) % n_sessions, torch.arange(point.M) % n_samples
     samples, gaps = samples[rows][:, columns].to(device), gaps[rows].to(device)
     ess = (ess[rows] * point.M / n_samples).to(device)
     source, whole = Generator(device).manual_seed(2), Belief(MODEL, point.M)
-    return lambda: whole.update(samples, ess, gaps[:, :-1], gaps[:, -1], source)
+    return lambda: whole.update(samples, ess, told(gaps[:, :-1], gaps[:, -1]), source)
 
 
 def resident(field: str) -> float:

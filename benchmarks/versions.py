@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
 MEASURE = "--measure"
 """First argument of a process that measures the version in its working directory."""
@@ -17,6 +18,7 @@ MEASURE = "--measure"
 # Not this folder, whose select.py hides Python's.
 sys.path[0] = os.getcwd() if MEASURE in sys.argv else str(Path(__file__).resolve().parents[1])
 
+import importlib.util
 import json
 import subprocess
 import time
@@ -60,19 +62,37 @@ def measured_in(folder: Path) -> dict[str, float]:
     return found
 
 
+def updater_of(belief: Any) -> Callable[..., Any]:
+    """The update by gaps of earlier answers (S H 1 D) and of the newest (S 1 D)."""
+    if not importlib.util.find_spec("torchrl_pref.questions"):  # version 0.1.0
+        return lambda samples, ess, *rest: belief.update(samples, ess, *rest)[:2]
+    import torch
+
+    from torchrl_pref.questions.choice import evidence_of_gaps
+
+    def update(samples: Any, ess: Any, gaps: Any, newest: Any, generator: Any) -> Any:
+        evidence = evidence_of_gaps(torch.cat([gaps, newest[:, None]], 1))
+        return belief.update(samples, ess, evidence, generator)[:2]
+
+    return update
+
+
 def measure() -> dict[str, float]:
     """CPU seconds of each part, with names that both versions know."""
     import torch
 
-    from torchrl_pref.acquisition.functions import information_gain
-    from torchrl_pref.beliefs.sampled import Belief, feature_gaps, uniform_sphere
-    from torchrl_pref.envs.feed import FeedEnv
-    from torchrl_pref.envs.query import QueryEnv
-    from torchrl_pref.humans.simulated import SimulatedHuman
-    from torchrl_pref.pool import Normalizer
-    from torchrl_pref.questions.responses import Boltzmann, Optimal, ResponseModel
+    from torchrl_pref import (
+        Belief,
+        Boltzmann,
+        FeedEnv,
+        Normalizer,
+        Optimal,
+        QueryEnv,
+        ResponseModel,
+        SimulatedHuman,
+        gridworld_pool,
+    )
     from torchrl_pref.strategies import Greedy
-    from torchrl_pref.tasks.gridworld import gridworld_pool
 
     torch.set_num_threads(1)
     pool = gridworld_pool()
@@ -81,15 +101,19 @@ def measure() -> dict[str, float]:
     def updates(model: ResponseModel, sessions: int, seed: int) -> float:
         """CPU seconds of an update of one session, over 20 answers to random questions."""
         generator, belief = torch.Generator().manual_seed(seed), Belief(model)
-        omega = uniform_sphere((sessions, 4, 1), generator)
+        omega = torch.randn(sessions, 4, 1, generator=generator)
+        omega /= omega.norm(dim=1, keepdim=True)
         samples, ess = belief.prior(sessions, 4, generator), torch.full((sessions,), 100.0)
         gaps, seconds = torch.zeros(sessions, 0, 1, 4), 0.0
+        update = updater_of(belief)
         for _ in range(20):
             asked = pool.features[torch.randint(1000, (sessions,), generator=generator)]
             likely = model((asked @ omega).squeeze(-1)).exp()
-            newest = feature_gaps(asked, likely.multinomial(1, generator=generator).squeeze(-1))
+            second = likely.multinomial(1, generator=generator).squeeze(-1) == 1
+            newest = torch.where(second[:, None], -1.0, 1.0) * (asked[:, 0] - asked[:, 1])
+            newest = newest.unsqueeze(1)
             start = time.process_time()
-            samples, ess, _ = belief.update(samples, ess, gaps, newest, generator)
+            samples, ess = update(samples, ess, gaps, newest, generator)
             seconds += time.process_time() - start
             gaps = torch.cat([gaps, newest[:, None]], 1)
         return seconds / 20 / sessions
@@ -100,7 +124,7 @@ def measure() -> dict[str, float]:
         env = QueryEnv(pool, human, belief, batch_size=(sessions,), seed=seed)
         start = time.process_time()
         with torch.no_grad():
-            taken = env.rollout(20, Greedy(model, information_gain))
+            taken = env.rollout(20, Greedy(model))
         return (time.process_time() - start) / taken.numel()
 
     def steps(kind: type[QueryEnv] | type[FeedEnv], action: int, seed: int) -> float:

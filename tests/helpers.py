@@ -8,6 +8,7 @@ import torch
 from conftest import RESPONSE_MODELS
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
+from torch import Tensor
 
 from torchrl_pref.beliefs.sampled import Belief
 from torchrl_pref.build import make_pools, make_task
@@ -15,6 +16,8 @@ from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.humans.simulated import SimulatedHuman
 from torchrl_pref.pool import QueryPool
+from torchrl_pref.questions.base import Evidence
+from torchrl_pref.questions.choice import evidence_of_gaps
 from torchrl_pref.questions.responses import ResponseModel
 from torchrl_pref.strategies import RandomAsk, RandomQuery
 from torchrl_pref.training.a2c import Trainer
@@ -103,3 +106,8 @@ def same(first: Any, second: Any) -> bool:
     if isinstance(first, torch.Tensor):
         return torch.equal(first.nan_to_num(7.5), second.nan_to_num(7.5))
     return bool(first == second) or (first != first and second != second)
+
+
+def told(earlier: Tensor, newest: Tensor) -> Evidence:
+    """The evidence of choices with feature gaps (S H K-1 D), and then one more (S K-1 D)."""
+    return evidence_of_gaps(torch.cat([earlier, newest.unsqueeze(1)], 1))

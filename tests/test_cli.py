@@ -219,7 +219,7 @@ def test_help_explains_every_key(script: str) -> None:
             assert value.replace("null", "none") in defaults, key
 
 
-PRETRAINED = ROOT / "torchrl_pref" / "pretrained" / "query-noisy-0.pt"
+PRETRAINED = ROOT / "torchrl_pref" / "policies" / "weights" / "query-noisy-0.pt"
 
 BAD_INPUT = [
     ("train", "setup=nonsense", "Could not find 'setup/nonsense'"),

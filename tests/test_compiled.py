@@ -17,6 +17,7 @@ from torchrl_pref.acquisition.functions import information_gain
 from torchrl_pref.acquisition.scoring import score_queries
 from torchrl_pref.beliefs.sampled import Belief
 from torchrl_pref.compiled import FEWEST, over_sessions, share_out
+from torchrl_pref.questions.choice import evidence_of_gaps
 from torchrl_pref.questions.responses import Boltzmann, Optimal, ResponseModel
 
 FAR_FROM_HERE = """
@@ -102,7 +103,7 @@ def test_no_number_depends_on_the_threads(model: ResponseModel, threads_back: No
         gaps = torch.randn(5 * FEWEST, 1, 1, 3, generator=generator)
         queries = torch.randn(5 * FEWEST, 4, 2, 3, generator=generator)
         update = belief.update(
-            samples, torch.full((len(gaps),), 100.0), gaps[:, :0], gaps[:, 0], generator
+            samples, torch.full((len(gaps),), 100.0), evidence_of_gaps(gaps), generator
         )
         return [*update, score_queries(update.samples, queries, model, information_gain)]
 

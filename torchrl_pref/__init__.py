@@ -14,12 +14,16 @@ if TYPE_CHECKING:
     from torchrl_pref.envs.query import QueryEnv
     from torchrl_pref.humans.simulated import SimulatedHuman
     from torchrl_pref.pool import Normalizer, QueryPool
-    from torchrl_pref.questions.responses import Boltzmann, Optimal, ResponseModel, calibrate_tau
+    from torchrl_pref.questions.calibrate import calibrate_tau
+    from torchrl_pref.questions.choice import Choice
+    from torchrl_pref.questions.responses import Boltzmann, Optimal, ResponseModel
+    from torchrl_pref.questions.weak import Weak
     from torchrl_pref.tasks.gridworld import gridworld_pool
 
 __all__ = [
     "Belief",
     "Boltzmann",
+    "Choice",
     "FeedEnv",
     "Normalizer",
     "Optimal",
@@ -27,6 +31,7 @@ __all__ = [
     "QueryPool",
     "ResponseModel",
     "SimulatedHuman",
+    "Weak",
     "calibrate_tau",
     "gridworld_pool",
     "load_policy",
@@ -39,7 +44,10 @@ _MODULES = {
     "envs.query": ("QueryEnv",),
     "humans.simulated": ("SimulatedHuman",),
     "pool": ("Normalizer", "QueryPool"),
-    "questions.responses": ("Boltzmann", "Optimal", "ResponseModel", "calibrate_tau"),
+    "questions.calibrate": ("calibrate_tau",),
+    "questions.choice": ("Choice",),
+    "questions.responses": ("Boltzmann", "Optimal", "ResponseModel"),
+    "questions.weak": ("Weak",),
     "tasks.gridworld": ("gridworld_pool",),
 }
 _HOME = {name: module for module, names in _MODULES.items() for name in names}

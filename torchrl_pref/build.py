@@ -25,7 +25,8 @@ from torchrl_pref.policies.base import Policy
 from torchrl_pref.policies.paper import paper_policy
 from torchrl_pref.policies.scorer import scorer_policy
 from torchrl_pref.pool import Normalizer, QueryPool
-from torchrl_pref.questions.responses import Boltzmann, Optimal, ResponseModel, calibrate_tau
+from torchrl_pref.questions.calibrate import calibrate_tau
+from torchrl_pref.questions.responses import Boltzmann, Optimal, ResponseModel
 from torchrl_pref.tasks.gridworld import gridworld_pool
 
 Settings = dict[str, Any]

@@ -4,12 +4,14 @@ from typing import Any
 import pytest
 import torch
 from conftest import RESPONSE_MODELS
+from helpers import told
 from posterior import posterior
 from torch import Generator, Tensor
 
 from benchmarks.posterior import Case, compare, history
 from torchrl_pref.beliefs.resampling import kish_share
-from torchrl_pref.beliefs.sampled import RESTART_SHARE, Belief, feature_gaps, uniform_sphere
+from torchrl_pref.beliefs.sampled import RESTART_SHARE, Belief, uniform_sphere
+from torchrl_pref.questions.choice import feature_gaps
 from torchrl_pref.questions.responses import Boltzmann, Optimal, ResponseModel
 
 
@@ -55,7 +57,7 @@ def converse(
     for h in range(len(queries)):
         earlier = gaps[:h].expand(sessions, *gaps[:h].shape)
         newest = gaps[h].expand(sessions, *gaps[h].shape)
-        update = belief.update(samples, ess, earlier, newest, generator)
+        update = belief.update(samples, ess, told(earlier, newest), generator)
         assert update.used.all()
         samples, ess = update.samples, update.ess
     return samples, ess
@@ -120,7 +122,7 @@ def test_calibration(
         log_probs = model((queries @ omega.unsqueeze(-1)).squeeze(-1))
         answers = log_probs.exp().multinomial(1, generator=generator).squeeze(-1)
         newest = feature_gaps(queries, answers)
-        samples, ess, _ = belief.update(samples, ess, gaps, newest, generator)
+        samples, ess, _ = belief.update(samples, ess, told(gaps, newest), generator)
         gaps = torch.cat([gaps, newest.unsqueeze(1)], 1)
         # Hard answers never exclude the human who gave them.
         returns = (gaps.flatten(1, 2) @ omega.unsqueeze(-1)).view(gaps.shape[:3])
@@ -169,7 +171,7 @@ def test_one_question_answered_both_ways_without_error_is_left_out(generator: Ge
     gaps = torch.zeros(sessions, 0, 2, 5)
     for answer, used in ((0, True), (1, False), (0, True), (2, False)):
         newest = feature_gaps(queries, torch.full((sessions,), answer))
-        after = belief.update(samples, ess, gaps, newest, generator)
+        after = belief.update(samples, ess, told(gaps, newest), generator)
         assert (after.used == used).all()
         if used:
             gaps = torch.cat([gaps, newest.unsqueeze(1)], 1)
@@ -185,12 +187,14 @@ def test_contradicting_hard_answer_is_left_out(generator: Generator) -> None:
     gaps = normals.view(3, 1, 1, 2).expand(3, 5, 1, 2)
     belief = Belief(Optimal())
     samples, ess = belief.prior(5, 2, generator), torch.full((5,), 100.0)
-    before, ess, used = belief.update(samples, ess, gaps[:0].transpose(0, 1), gaps[0], generator)
+    evidence = told(gaps[:0].transpose(0, 1), gaps[0])
+    before, ess, used = belief.update(samples, ess, evidence, generator)
     assert used.all()
-    before, ess, used = belief.update(before, ess, gaps[:1].transpose(0, 1), gaps[1], generator)
+    evidence = told(gaps[:1].transpose(0, 1), gaps[1])
+    before, ess, used = belief.update(before, ess, evidence, generator)
     assert used.all()
     assert (before @ normals[:2].T >= -1e-5).all()
-    after = belief.update(before, ess, gaps[:2].transpose(0, 1), gaps[2], generator)
+    after = belief.update(before, ess, told(gaps[:2].transpose(0, 1), gaps[2]), generator)
     assert not after.used.any()
     assert torch.equal(after.samples, before)
     assert torch.equal(after.ess, ess)
@@ -219,9 +223,8 @@ def test_soft_answers_are_never_left_out(generator: Generator) -> None:
     belief = Belief(Boltzmann(1000.0))
     samples, ess = belief.prior(20, 2, generator), torch.full((20,), 100.0)
     for h in range(12):
-        samples, ess, used = belief.update(
-            samples, ess, gaps[:h].transpose(0, 1), gaps[h], generator
-        )
+        evidence = told(gaps[:h].transpose(0, 1), gaps[h])
+        samples, ess, used = belief.update(samples, ess, evidence, generator)
         assert used.all()
     assert samples.isfinite().all()
 
@@ -248,7 +251,7 @@ def test_ordinary_answers_are_no_surprise(
         queries = torch.randn(sessions, n_options, 4, generator=generator)
         answers = model((queries @ omega).squeeze(-1)).exp().multinomial(1, generator=generator)
         newest = feature_gaps(queries, answers.squeeze(-1))
-        samples, ess, _ = belief.update(samples, ess, gaps, newest, generator)
+        samples, ess, _ = belief.update(samples, ess, told(gaps, newest), generator)
         gaps = torch.cat([gaps, newest.unsqueeze(1)], 1)
     assert sum(begun) < 0.1 * 4 * sessions
 
@@ -281,7 +284,7 @@ def test_narrow_posteriors_are_still_explored(generator: Generator) -> None:
     for h in range(14):
         mean = samples.mean(1)
         normal = torch.stack([-mean[:, 1], mean[:, 0]], -1).unsqueeze(1)
-        samples, ess, used = belief.update(samples, ess, gaps, normal, generator)
+        samples, ess, used = belief.update(samples, ess, told(gaps, normal), generator)
         assert used.all()
         gaps = torch.cat([gaps, normal.unsqueeze(1)], 1)
         assert ess.mean() > 40, h
@@ -321,9 +324,8 @@ def test_large_batches_lose_no_answer(
     for row, count in enumerate((2, 3)):
         samples[row::2, :, : count - 1] = samples[row::2, :, : count - 1].abs()
     newest = normals[2].expand(sessions, 1, 3)
-    after, _, used = belief.update(
-        samples, torch.full((sessions,), 40.0), earlier, newest, generator
-    )
+    ess = torch.full((sessions,), 40.0)
+    after, _, used = belief.update(samples, ess, told(earlier, newest), generator)
     assert used.all()
     kept = [(after[row::2, :, :count] >= -1e-5).float().mean() for row, count in enumerate((1, 2))]
     assert min(kept) > (0.999 if isinstance(model, Optimal) else 0.8)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import RESPONSE_MODELS
+from helpers import told
 from torch import Generator, Tensor
 
 from torchrl_pref.beliefs.resampling import (
@@ -23,9 +24,10 @@ from torchrl_pref.beliefs.resampling import (
     tensor_share,
 )
 from torchrl_pref.beliefs.resampling_cpu import compiled_resample
-from torchrl_pref.beliefs.sampled import Belief, feature_gaps, uniform_sphere
+from torchrl_pref.beliefs.sampled import Belief, uniform_sphere
 from torchrl_pref.beliefs.slice import ARC, MAX_SHRINKS, Target, tensor_moves
 from torchrl_pref.beliefs.slice_cpu import compiled_moves
+from torchrl_pref.questions.choice import evidence_of_gaps, feature_gaps
 from torchrl_pref.questions.responses import Boltzmann, ResponseModel, compiled_constants
 
 
@@ -44,17 +46,20 @@ def test_compiled_moves_go_where_those_in_tensors_do(
         queries = torch.randn(sessions, n_options, n_features, generator=generator)
         answers = model((queries @ omega).squeeze(-1)).exp().multinomial(1, generator=generator)
         newest = feature_gaps(queries, answers.squeeze(-1))
-        samples, ess, _ = belief.update(samples, ess, gaps, newest, generator)
+        samples, ess, _ = belief.update(samples, ess, told(gaps, newest), generator)
         gaps[:, h] = newest  # until then a row of zeros
         if h in (0, 4, 8):
             normal = torch.randn(sessions, FRAMES, 1, n_features, generator=generator)
             poles = poles_of(samples, normal)
             uniform = torch.rand(1, sessions, 100, 2 + MAX_SHRINKS, generator=generator)
             slack = torch.rand(sessions, generator=generator) / 10
-            target = Target(gaps, slack, torch.full((sessions,), power), model)
+            answers = evidence_of_gaps(gaps)
+            target = Target(answers, slack, torch.full((sessions,), power), model)
             constants = compiled_constants(model)
             assert constants is not None
-            compiled = compiled_moves(samples, poles, uniform, *target[:3], ARC, *constants)
+            evidence = answers.rows, answers.offsets, answers.floor
+            given = *evidence, *target[1:3], ARC, *constants
+            compiled = compiled_moves(samples, poles, uniform, *given)
             close = (compiled - tensor_moves(samples, poles, uniform, target)).norm(dim=-1) < 1e-3
             # A proposal at the very edge of its slice may be judged differently.
             assert close.float().mean() > 0.99
@@ -71,9 +76,9 @@ def test_compiled_moves_go_where_those_in_tensors_do(
 def test_moves_in_tensors_stay_on_their_device(model: ResponseModel) -> None:
     """``meta`` stands for a GPU: nothing is computed, but devices must not be mixed."""
     shapes = (5, 30, 4), (5, FRAMES, 6, 4), (6, 5, 30, 2 + MAX_SHRINKS), (5, 7, 1, 4), (5,), (5,)
-    samples, normal, uniform, *rest = (torch.empty(shape, device="meta") for shape in shapes)
+    samples, normal, uniform, gaps, *rest = (torch.empty(shape, device="meta") for shape in shapes)
     poles = poles_of(samples, normal)
-    moved = tensor_moves(samples, poles, uniform, Target(*rest, model))
+    moved = tensor_moves(samples, poles, uniform, Target(evidence_of_gaps(gaps), *rest, model))
     assert explained_share(samples, moved).device.type == "meta"
     assert moved.device.type == "meta"
     assert moved.shape == shapes[0]

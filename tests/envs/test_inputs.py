@@ -10,16 +10,19 @@ from typing import Any
 import pytest
 import torch
 from conftest import RESPONSE_MODELS
+from helpers import told
 from tensordict import TensorDict
 from torch import Generator
 
-from torchrl_pref.beliefs.sampled import Belief, feature_gaps, uniform_sphere
+from torchrl_pref.beliefs.sampled import Belief, uniform_sphere
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.errors import InputError
 from torchrl_pref.humans.simulated import SimulatedHuman
 from torchrl_pref.pool import Normalizer, QueryPool, balance
-from torchrl_pref.questions.responses import Boltzmann, Optimal, calibrate_tau
+from torchrl_pref.questions.calibrate import calibrate_tau
+from torchrl_pref.questions.choice import feature_gaps
+from torchrl_pref.questions.responses import Boltzmann, Optimal
 
 MODEL = RESPONSE_MODELS[0]
 
@@ -113,11 +116,11 @@ def test_a_belief_is_not_updated_by_what_is_not_finite(bad: float, generator: Ge
     samples = belief.prior(3, 4, generator)
     ess = torch.full((3,), 20.0)
     earlier, newest = torch.zeros(3, 2, 1, 4), torch.rand(3, 1, 4)
-    belief.update(samples, ess, earlier, newest, generator)
+    belief.update(samples, ess, told(earlier, newest), generator)
     for spoiled in (samples, earlier, newest):
         kept = spoiled[1].clone()
         spoiled[1].view(-1)[2] = bad
-        refused(lambda: belief.update(samples, ess, earlier, newest, generator))
+        refused(lambda: belief.update(samples, ess, told(earlier, newest), generator))
         spoiled[1] = kept
 
 

@@ -46,9 +46,9 @@ def test_resumed_run_equals_an_uninterrupted_one_bit_for_bit(
     assert same(whole.weights, resumed.weights)
     for name in ("update", "optimizer", "sessions", "env_generator", "global_generator"):
         assert same(whole.training[name], resumed.training[name]), name
-    for name, values in whole.progress.history.items():
+    for name, values in whole.training["history"].items():
         if name.startswith("train/"):
-            assert same(values, resumed.progress.history[name])
+            assert same(values, resumed.training["history"][name])
     tables = [(tmp_path / f"run{n}" / "training.csv").read_text() for n in (0, 2)]
     untimed = [[row.split(",")[:6] for row in table.splitlines()] for table in tables]
     assert untimed[0] == untimed[1]

@@ -77,7 +77,7 @@ def score_queries(
     """
     constants = compiled_constants(response_model)
     functions = acquisition.functions if isinstance(acquisition, Together) else (acquisition,)
-    known = all(each in COMPILED for each in functions)
+    known = response_model.is_plain and all(each in COMPILED for each in functions)
     if constants is None or not known or not (_is_plain(samples) and _is_plain(queries)):
         return score_in_tensors(samples, queries, response_model, acquisition)
     scores = compiled_scores(samples, queries, *constants)

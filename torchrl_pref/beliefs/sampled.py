@@ -1,6 +1,6 @@
 """The belief over the reward weights ω: samples on the unit sphere, batched over sessions.
 
-Shapes: S sessions, M samples, H answers, K options per query, D features.
+Shapes: S sessions, M samples, H answers, F factors of an answer, J rows of a factor, D features.
 
 The prior is uniform on the unit sphere: alignment ignores the scale of ω, and tau carries it.
 After each answer the samples take a step of *resample-move* (Gilks and Berzuini, 2001): reweight by
@@ -24,8 +24,9 @@ from torchrl_pref.beliefs.resampling import kish_share, resample
 from torchrl_pref.beliefs.slice import Target, round_of_moves
 from torchrl_pref.config.memory import default_moves
 from torchrl_pref.errors import check_count, check_type
+from torchrl_pref.questions.base import Evidence
 from torchrl_pref.questions.responses import ResponseModel
-from torchrl_pref.tensors import check_finite, check_range
+from torchrl_pref.tensors import check_finite
 
 MIN_SHARE = 0.25
 """Kish effective share of the samples that a reweighting must keep; below it a stage is added."""
@@ -55,28 +56,6 @@ def uniform_sphere(shape: tuple[int, ...], generator: Generator) -> Tensor:
     """Draw weights uniformly on the unit sphere, (… D), on the generator's device."""
     normal = torch.randn(shape, generator=generator, device=generator.device)
     return F.normalize(normal, dim=-1)
-
-
-def feature_gaps(queries: Tensor, answers: Tensor) -> Tensor:
-    """How the features of the chosen option exceed those of the others.
-
-    Args:
-        queries: (… K D), features of the options.
-        answers: (…), index of the chosen option, or -1 where there is no answer yet.
-
-    Returns:
-        (… K-1 D). Zero where there is no answer, which makes that likelihood constant in ω.
-
-    Raises:
-        InputError: an answer is no whole number from -1 to K-1.
-    """
-    n_options = queries.shape[-2]
-    answers = check_range("answers", answers, -1, n_options - 1, "options from 0, -1 where none")
-    shifts = torch.arange(1, n_options, device=queries.device)
-    others = (answers.unsqueeze(-1) + shifts) % n_options
-    chosen = torch.take_along_dim(queries, answers.clamp(min=0)[..., None, None], -2)
-    gaps = chosen - torch.take_along_dim(queries, others.unsqueeze(-1), -2)
-    return gaps * (answers >= 0)[..., None, None]
 
 
 class Update(NamedTuple):
@@ -118,7 +97,7 @@ class Belief:
         return uniform_sphere((n_sessions, self.n_samples, n_features), generator)
 
     def update(
-        self, samples: Tensor, ess: Tensor, earlier: Tensor, newest: Tensor, generator: Generator
+        self, samples: Tensor, ess: Tensor, answers: Evidence, generator: Generator
     ) -> Update:
         r"""Condition on one more answer per session.
 
@@ -141,21 +120,19 @@ class Belief:
         Args:
             samples: (S M D), samples of the belief before the answer.
             ess: (S), their effective sample size.
-            earlier: (S H K-1 D), :func:`feature_gaps` of the earlier answers; zero rows are
-                ignored, H may be 0.
-            newest: (S K-1 D), feature gaps of the answer to condition on.
+            answers: (S H), what ``response_model.evidence`` makes of all answers. The last is the
+                one to condition on; of the others, those that are -1 count for nothing.
             generator: the source of all randomness, on the device of the samples.
 
         Raises:
-            InputError: a sample or a gap is not finite.
+            InputError: a sample or a feature is not finite.
         """
-        check_finite("samples or feature gaps", samples, earlier, newest)
+        check_finite("samples or features of the answers", samples, answers.rows)
         size = max(1, MOVED // (self.n_samples * self._moves_for(samples.shape[-1])))
         updates = []
         for first in range(0, max(1, len(samples)), size):
             some = slice(first, first + size)
-            session = samples[some], ess[some], earlier[some], newest[some]
-            updates.append(self._update(*session, generator))
+            updates.append(self._update(samples[some], ess[some], answers[some], generator))
         return Update(*(torch.cat(field) for field in zip(*updates, strict=True)))
 
     def _moves_for(self, n_features: int) -> int:
@@ -163,11 +140,10 @@ class Belief:
         return default_moves(n_features) if self.n_moves is None else self.n_moves
 
     def _update(
-        self, samples: Tensor, ess: Tensor, earlier: Tensor, newest: Tensor, generator: Generator
+        self, samples: Tensor, ess: Tensor, answers: Evidence, generator: Generator
     ) -> Update:
         """:meth:`update` for as many sessions as are held in memory at once."""
-        answers = torch.cat([earlier, newest.unsqueeze(1)], 1)
-        foreseen = self.response_model.log_likelihood(_gaps(samples, newest))
+        foreseen = self._likelihood(samples, answers[:, -1])
         surprised = foreseen.exp().mean(1) < SURPRISE
         if surprised.any():
             indeed = self._surprised(samples[surprised], answers[surprised])
@@ -191,20 +167,27 @@ class Belief:
         moved, inflation, used = after
         return Update(moved, torch.where(used, self.n_samples / inflation, ess), used)
 
-    def _surprised(self, samples: Tensor, answers: Tensor) -> Tensor:
-        """(S), whether samples (S M D) held the last of answers (S H K-1 D) for too unlikely."""
-        model, gaps, newest = self.response_model, _gaps(samples, answers), answers[:, -1]
-        foreseen = model.log_likelihood(gaps[:, :, -1]).exp()
-        # The most that any ω would give it, or nearly: that of the sample or the mean gap.
-        ahead = F.normalize(newest.sum(1), dim=-1).unsqueeze(1)
-        most = model.log_likelihood(_gaps(ahead, newest)).exp()
-        most = torch.cat([foreseen, most], 1).amax(1)
+    def _likelihood(self, samples: Tensor, answers: Evidence) -> Tensor:
+        """(S M), log-likelihood of an answer (S) or of all answers (S H) under samples (S M D)."""
+        gaps, floor = answers.gaps(samples), answers.floor.unsqueeze(1)
+        one = answers.floor.ndim == 1
+        model = self.response_model
+        return (model.answer_log_likelihood if one else model.joint_log_likelihood)(gaps, floor)
+
+    def _surprised(self, samples: Tensor, answers: Evidence) -> Tensor:
+        """(S), whether samples (S M D) held the last of answers (S H) for too unlikely."""
+        newest = answers[:, -1]
+        foreseen = self._likelihood(samples, newest).exp()
+        # The most that any ω would give it, or nearly: that of the sample or the mean row.
+        ahead = F.normalize(newest.rows.sum((1, 2)), dim=-1).unsqueeze(1)
+        most = torch.cat([foreseen, self._likelihood(ahead, newest).exp()], 1).amax(1)
         # Where an answer can be impossible no power of its likelihood makes it less so.
-        possible = model.joint_log_likelihood(-gaps).isfinite().all(1)
+        against = Evidence(-answers.rows, answers.offsets, answers.floor)
+        possible = self._likelihood(samples, against).isfinite().all(1)
         return possible & (foreseen.mean(1) < SURPRISE * most)
 
     def _let_in(
-        self, samples: Tensor, inflation: Tensor, answers: Tensor, generator: Generator
+        self, samples: Tensor, inflation: Tensor, answers: Evidence, generator: Generator
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Let in the last of the answers at once.
 
@@ -212,13 +195,13 @@ class Belief:
             Samples (S M D), inflation (S), and that the answer was used (S).
         """
         model = self.response_model
-        log_weights = model.log_likelihood(_gaps(samples, answers[:, -1]))
+        log_weights = self._likelihood(samples, answers[:, -1])
         target = Target(answers, torch.zeros_like(inflation), torch.ones_like(inflation), model)
         after = self._resample_move(samples, inflation, log_weights, target, generator)
         return *after, torch.ones_like(inflation, dtype=torch.bool)
 
     def _let_in_by_stages(
-        self, samples: Tensor, inflation: Tensor, answers: Tensor, generator: Generator
+        self, samples: Tensor, inflation: Tensor, answers: Evidence, generator: Generator
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Let in the last of the answers, by a slack that falls to zero.
 
@@ -233,28 +216,30 @@ class Belief:
         for stage in range(MAX_STAGES):
             if todo.numel() == 0:
                 break
-            gaps = _gaps(samples[todo], answers[todo, -1])
-            log_now = self._log_raised(gaps, slack[todo])
-            next_slack = self._next_slack(gaps, slack[todo], log_now)
+            newest = answers[todo, -1]
+            gaps, floor = newest.gaps(samples[todo]), newest.floor.unsqueeze(1)
+            log_now = self._log_raised(gaps, floor, slack[todo])
+            next_slack = self._next_slack(gaps, floor, slack[todo], log_now)
             if stage == MAX_STAGES - 1:
                 # Better a few copies than no answer: only an impossible one is left out.
-                possible = self._log_raised(gaps, torch.zeros_like(next_slack)) > -math.inf
+                possible = self._log_raised(gaps, floor, torch.zeros_like(next_slack)) > -math.inf
                 next_slack = torch.where(possible.any(1), 0.0, next_slack)
             slack[todo] = next_slack
-            log_weights = self._log_weights(gaps, next_slack, log_now)
+            log_weights = self._log_weights(gaps, floor, next_slack, log_now)
             target = Target(answers[todo], next_slack, torch.ones_like(next_slack), model)
             given = samples[todo], inflation[todo], log_weights, target, generator
             samples[todo], inflation[todo] = self._resample_move(*given)
             todo = todo[next_slack > 0]
         # In float64, where one gap and its negative differ by nothing that counts.
-        gaps = _gaps(samples.double(), answers.double())
-        agrees = model.agrees(gaps[:, :, -1]) & (model.joint_log_likelihood(gaps) > -math.inf)
+        gaps, floor = answers.double().gaps(samples.double()), answers.floor.unsqueeze(1).double()
+        possible = model.joint_log_likelihood(gaps, floor) > -math.inf
+        agrees = model.agrees(gaps[:, :, -1]) & possible
         used = (slack == 0) & agrees.any(1)
         samples = torch.where(used[:, None, None], samples, before[0])
         return samples, torch.where(used, inflation, before[1]), used
 
     def _begin_anew(
-        self, samples: Tensor, inflation: Tensor, answers: Tensor, generator: Generator
+        self, samples: Tensor, inflation: Tensor, answers: Evidence, generator: Generator
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Let in all answers from the prior, by a power of their likelihood that rises to one.
 
@@ -270,7 +255,7 @@ class Belief:
         for stage in range(RESTART_STAGES):
             if todo.numel() == 0:
                 break
-            likelihood = model.joint_log_likelihood(_gaps(samples[todo], answers[todo]))
+            likelihood = self._likelihood(samples[todo], answers[todo])
             now = power[todo]
             next_power = self._next_power(likelihood, now)
             if stage == RESTART_STAGES - 1:
@@ -293,31 +278,32 @@ class Belief:
             lambda to: kish_share((to - power).unsqueeze(-1) * likelihood) >= RESTART_SHARE,
         )
 
-    def _log_raised(self, gaps: Tensor, slack: Tensor) -> Tensor:
-        """(… S M), of one answer with gaps (S M K-1) raised by slack (… S); infinite slack gives
-        0."""
-        raised = gaps + slack.nan_to_num(posinf=0.0)[..., None, None]
-        log_likelihood = self.response_model.log_likelihood(raised)
+    def _log_raised(self, gaps: Tensor, floor: Tensor, slack: Tensor) -> Tensor:
+        """(… S M), of one answer with gaps (S M F J) raised by slack (… S) and a floor (S 1);
+        infinite slack gives 0."""
+        raised = gaps + slack.nan_to_num(posinf=0.0)[..., None, None, None]
+        log_likelihood = self.response_model.answer_log_likelihood(raised, floor)
         return log_likelihood.masked_fill(slack.isinf()[..., None], 0.0)
 
-    def _log_weights(self, gaps: Tensor, slack: Tensor, log_now: Tensor) -> Tensor:
+    def _log_weights(self, gaps: Tensor, floor: Tensor, slack: Tensor, log_now: Tensor) -> Tensor:
         """(… S M), of samples with log-likelihoods (S M) when an answer's slack becomes this
         (… S)."""
         # By rounding a sample may lie just outside of where it was moved to, and is dropped.
-        return self._log_raised(gaps, slack) - log_now.clamp(min=torch.finfo(log_now.dtype).min)
+        lowest = torch.finfo(log_now.dtype).min
+        return self._log_raised(gaps, floor, slack) - log_now.clamp(min=lowest)
 
-    def _next_slack(self, gaps: Tensor, slack: Tensor, log_now: Tensor) -> Tensor:
+    def _next_slack(self, gaps: Tensor, floor: Tensor, slack: Tensor, log_now: Tensor) -> Tensor:
         """(S), the smallest slack that keeps enough of the samples effective."""
         result = torch.zeros_like(slack)
-        few = kish_share(self._log_weights(gaps, result, log_now)) < MIN_SHARE
+        few = kish_share(self._log_weights(gaps, floor, result, log_now)) < MIN_SHARE
         if few.any():
-            gaps, log_now = gaps[few], log_now[few]
+            gaps, floor, log_now = gaps[few], floor[few], log_now[few]
             # At this slack every sample agrees, so the weights differ by a factor of at most K.
-            start = torch.minimum(slack[few], (-gaps).amax((1, 2)).clamp(min=0))
+            start = torch.minimum(slack[few], (-gaps).amax((1, 2, 3)).clamp(min=0))
             result[few] = _furthest(
                 start,
                 torch.zeros_like(start),
-                lambda to: kish_share(self._log_weights(gaps, to, log_now)) >= MIN_SHARE,
+                lambda to: kish_share(self._log_weights(gaps, floor, to, log_now)) >= MIN_SHARE,
             )
         return result
 
@@ -343,12 +329,6 @@ class Belief:
             moved[who], explained = round_of_moves(*again, generator)
             inflation[who] = 1 + explained * excess[who]
         return moved, inflation.clamp(1, samples.shape[1])
-
-
-def _gaps(samples: Tensor, feature_gaps: Tensor) -> Tensor:
-    """Return gaps (S M … K-1) under samples (S M D), from feature gaps (S … K-1 D)."""
-    rows = feature_gaps.flatten(1, -2)
-    return (samples @ rows.mT).unflatten(-1, feature_gaps.shape[1:-1])
 
 
 def _furthest(start: Tensor, end: Tensor, fits: Callable[[Tensor], Tensor]) -> Tensor:

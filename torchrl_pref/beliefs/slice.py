@@ -1,7 +1,7 @@
 """The Markov moves of the belief: slice sampling on the unit sphere along great circles.
 
-Shapes: S sessions, M samples, H answers, K options per query, D features, V moves, P sets of
-samples that share a pole, U uniforms of a move.
+Shapes: S sessions, M samples, H answers, F factors of an answer, J rows of a factor, D features, V
+moves, P sets of samples that share a pole, U uniforms of a move.
 
 A slice sampler (Neal, 2003) restricted to a great circle through the current point (Habeck,
 Hasenpflug, Kodgirwar and Rudolf, *Geodesic slice sampling on the sphere*, 2023). It has no step
@@ -23,6 +23,7 @@ from torch.nn import functional as F
 
 from torchrl_pref.beliefs.resampling import FRAMES, explained_share, group_of, poles_of
 from torchrl_pref.beliefs.slice_cpu import compiled_moves
+from torchrl_pref.questions.base import Evidence
 from torchrl_pref.questions.responses import ResponseModel, compiled_constants
 
 ARC = 32.0
@@ -37,10 +38,10 @@ would have gone, so that giving up leaves the posterior invariant too."""
 class Target(NamedTuple):
     """A density on the sphere: a power of the likelihood of all answers, the last one eased."""
 
-    answers: Tensor
-    """(S H K-1 D), feature gaps of at least one answer; zero rows are ignored."""
+    answers: Evidence
+    """(S H), of at least one answer."""
     slack: Tensor
-    """(S), by how much the return gaps of the last answer are raised."""
+    """(S), by how much the return gaps of the last answer are raised further."""
     power: Tensor
     """(S), to which the likelihood is raised."""
     response_model: ResponseModel
@@ -85,7 +86,8 @@ def round_of_moves(
     constants = compiled_constants(target.response_model)
     if samples.is_cpu and constants is not None:
         answers, slack, power, _ = target
-        moved = compiled_moves(samples, poles, uniform, answers, slack, power, ARC, *constants)
+        evidence = answers.rows, answers.offsets, answers.floor
+        moved = compiled_moves(samples, poles, uniform, *evidence, slack, power, ARC, *constants)
     else:
         moved = tensor_moves(samples, poles, uniform, target)
     return moved, explained_share(start, moved)
@@ -116,16 +118,20 @@ def _tensor_move(samples: Tensor, poles: Tensor, uniform: Tensor, target: Target
     tangents = across / height
     pole_angle = torch.atan2(height, along).squeeze(-1)
     # Samples are innermost in memory: every operation below then runs along them.
-    size = (*target.answers.shape[:3], samples.shape[1])
-    rows = target.answers.flatten(1, 2)
-    cosine = (rows @ samples.mT).view(size).permute(1, 2, 0, 3).contiguous()
-    sine = (rows @ tangents.mT).view(size).permute(1, 2, 0, 3).contiguous()
+    answers = target.answers
+    size = (*answers.rows.shape[:-1], samples.shape[1])
+    rows = answers.rows.flatten(1, -2)
+    cosine = (rows @ samples.mT).view(size).permute(1, 2, 3, 0, 4).contiguous()
+    sine = (rows @ tangents.mT).view(size).permute(1, 2, 3, 0, 4).contiguous()
+    raised = answers.offsets.permute(1, 2, 3, 0).unsqueeze(-1).expand_as(cosine).clone()
+    raised[-1] += target.slack.unsqueeze(-1)
+    floor = answers.floor.unsqueeze(1)
 
     def log_density(angle: Tensor) -> Tensor:
         """(S M), of the points at an angle (S M) on their circles."""
-        gaps = torch.addcmul(cosine * angle.cos(), sine, angle.sin())
-        gaps[-1] += target.slack.unsqueeze(-1)
-        likelihood = target.response_model.joint_log_likelihood(gaps.permute(2, 3, 0, 1))
+        gaps = torch.addcmul(cosine * angle.cos(), sine, angle.sin()) + raised
+        model = target.response_model
+        likelihood = model.joint_log_likelihood(gaps.permute(3, 4, 0, 1, 2), floor)
         meridian = (pole_angle - angle).sin().abs().clamp(min=1e-30).log()
         return target.power.unsqueeze(-1) * likelihood + meridians * meridian
 
@@ -137,9 +143,7 @@ def _tensor_move(samples: Tensor, poles: Tensor, uniform: Tensor, target: Target
     arc = (ARC * poles.norm(dim=-1)).clamp(min=0 if meridians else 2 * math.pi, max=2 * math.pi)
     high = place * arc
     # Where the answers are possible is the same seen from each place there.
-    raised = torch.zeros_like(cosine)
-    raised[-1] += target.slack.unsqueeze(-1)
-    circles = cosine.flatten(0, 1), sine.flatten(0, 1), raised.flatten(0, 1)
+    circles = (part.flatten(0, 2) for part in (cosine, sine, raised))
     first, last = target.response_model.possible_arc(*circles)
     low, high = torch.maximum(high - arc, first), torch.minimum(high, last)
     found = torch.zeros_like(angle, dtype=torch.bool)

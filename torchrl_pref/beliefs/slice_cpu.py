@@ -7,9 +7,9 @@ that the processor takes several at once. The first call on a new machine takes 
 A move needs of ω only its return gaps: they turn with ω, and all samples of a group move towards
 one pole, so that a move costs as much for many features as for few.
 
-Shapes: S sessions, M samples, H answers, K options per query, D features, V moves, P sets of
-samples that share a pole, U uniforms of a move, G = h (K-1) return gaps of the h answers that a
-session has.
+Shapes: S sessions, M samples, H answers, F factors of an answer, J rows of a factor, D features, V
+moves, P sets of samples that share a pole, U uniforms of a move, G rows of all the answers that a
+session has, E factors of these.
 """
 
 from __future__ import annotations
@@ -30,7 +30,9 @@ def compiled_moves(
     samples: Tensor,
     poles: Tensor,
     uniform: Tensor,
-    answers: Tensor,
+    rows: Tensor,
+    offsets: Tensor,
+    floor: Tensor,
     slack: Tensor,
     power: Tensor,
     arc: float,
@@ -43,7 +45,7 @@ def compiled_moves(
         samples: (S M D).
         poles: (V S P D).
         uniform: (V S M U), in [0, 1): two, and one for each shrink.
-        answers: (S H K-1 D), feature gaps.
+        rows, offsets, floor: (S H F J D), (S H F J) and (S H), see ``questions.base.Evidence``.
         slack, power: (S), see ``sampler.Target``.
         arc: length of the arc that is searched, in lengths of the pole.
         tau: what the gaps are multiplied by; infinite for answers without error.
@@ -53,7 +55,7 @@ def compiled_moves(
         (S M D), unit vectors.
     """
     moved = torch.empty_like(samples, memory_format=torch.contiguous_format)
-    given = samples, poles, uniform, answers, slack, power, moved
+    given = samples, poles, uniform, rows, offsets, floor, slack, power, moved
     arrays = (t.contiguous().numpy() for t in given)
     over_sessions(_move_sessions, len(samples), *arrays, arc, tau, tolerance)
     return moved
@@ -66,7 +68,9 @@ def _move_sessions(
     samples: Array,
     poles: Array,
     uniform: Array,
-    answers: Array,
+    rows: Array,
+    offsets: Array,
+    floor: Array,
     slack: Array,
     power: Array,
     moved: Array,
@@ -75,29 +79,46 @@ def _move_sessions(
     tolerance: float,
 ) -> None:
     """Fill ``moved`` (S M D)."""
-    n_others, hard = answers.shape[2], math.isinf(tau)
+    hard = math.isinf(tau)
     for s in range(first, last):
-        rows, raised = _rows_of(answers[s], slack[s], 1.0 if hard else tau)
-        given = rows, raised, float(power[s]), arc, n_others, hard, tolerance
-        _move_session(samples[s], poles[:, s], uniform[:, s], moved[s], *given)
+        unit = 1.0 if hard else tau
+        given = _flatten(rows[s], offsets[s], floor[s], float(slack[s]), unit)
+        constants = float(power[s]), arc, hard, tolerance
+        _move_session(samples[s], poles[:, s], uniform[:, s], moved[s], *given, *constants)
 
 
 @compiled
-def _rows_of(answers: Array, slack: float, unit: float) -> tuple[Array, Array]:
-    """Feature gaps (G D) of the answers (H K-1 D) that there are, in units of 1/tau, and by how
-    much the return gaps are raised (G): those of the last answer by the slack."""
-    n_answers, n_others, n_features = answers.shape
-    rows = np.empty((n_answers * n_others, n_features))
-    raised = np.zeros(len(rows))
-    g = 0
+def _flatten(
+    rows: Array, offsets: Array, floor: Array, slack: float, unit: float
+) -> tuple[Array, Array, Array, Array]:
+    """The evidence (H F J D) that there is, in units of 1/tau.
+
+    Returns:
+        Rows (G D), by how much their returns are raised (G), where each factor ends among the rows
+        (E), and the floor of the answer that ends with a factor (E), -1 where none does.
+    """
+    n_answers, n_factors, n_rows, n_features = rows.shape
+    size = n_answers * n_factors
+    flat, raised = np.empty((size * n_rows, n_features)), np.empty(size * n_rows)
+    ends, floors = np.empty(size, np.int64), np.empty(size)
+    g = e = 0
     for h in range(n_answers):
         newest = h == n_answers - 1
-        if newest or np.any(answers[h]):
-            for k in range(n_others):
-                rows[g] = unit * answers[h, k]
-                raised[g] = unit * slack if newest else 0.0
-                g += 1
-    return rows[:g], raised[:g]
+        if not newest and not np.any(rows[h]):  # open, or about options that are alike
+            continue
+        for f in range(n_factors):
+            before = g
+            for j in range(n_rows):
+                if offsets[h, f, j] < math.inf:
+                    flat[g] = unit * rows[h, f, j]
+                    raised[g] = unit * (offsets[h, f, j] + (slack if newest else 0.0))
+                    g += 1
+            if g > before:
+                ends[e], floors[e] = g, -1.0
+                e += 1
+        if e > 0:
+            floors[e - 1] = floor[h]
+    return flat[:g], raised[:g], ends[:e], floors[:e]
 
 
 @compiled
@@ -108,9 +129,10 @@ def _move_session(
     moved: Array,
     rows: Array,
     raised: Array,
+    ends: Array,
+    floors: Array,
     power: float,
     arc: float,
-    n_others: int,
     hard: bool,
     tolerance: float,
 ) -> None:
@@ -133,12 +155,12 @@ def _move_session(
     # At an angle on a circle the gaps are circles[0] cos(angle) + circles[1] sin(angle) + raised.
     circles = np.empty((2, len(raised), n_samples))
     for v in range(len(poles)):
-        along, height, pole, ends = _aim(places, poles[v], uniform[v], arc)
+        along, height, pole, arcs = _aim(places, poles[v], uniform[v], arc)
         ahead = _products(poles[v], rows)
         circles[0] = gaps
         _turn_gaps(gaps, circles[1], ahead, along, height)
-        given = circles, raised, pole, ends, uniform[v], power, n_features - 2
-        turn = _search(*given, n_others, hard, tolerance)
+        given = circles, raised, ends, floors, pole, arcs, uniform[v], power, n_features - 2
+        turn = _search(*given, hard, tolerance)
         cosine, sine = np.cos(turn), np.sin(turn)
         for m in range(n_samples):
             sine[m] /= height[m]
@@ -220,31 +242,33 @@ def _aim(
 def _search(
     circles: Array,
     raised: Array,
-    pole: Array,
     ends: Array,
+    floors: Array,
+    pole: Array,
+    arcs: Array,
     uniform: Array,
     power: float,
     meridians: int,
-    n_others: int,
     hard: bool,
     tolerance: float,
 ) -> Array:
     """Angles (M) in the slices: proposals on the arcs, which shrink to each one that is refused."""
     n = circles.shape[2]
     turn, angle, cosine, sine = np.zeros(n), np.empty(n), np.ones(n), np.zeros(n)
-    level = _surprise(circles, raised, cosine, sine, n_others, hard, tolerance)
+    level = _surprise(circles, raised, ends, floors, cosine, sine, hard, tolerance)
     for m in range(n):
         level[m] = power * level[m] - meridians * _log(abs(pole[1, m]))
         level[m] = min(level[m] - _log(1.0 - uniform[m, 1]), 1e300)  # the impossible stays above
-    if hard:
-        _cut_arcs(ends, circles, raised, tolerance)
+    if hard and not np.any(floors > 0):
+        _cut_arcs(arcs, circles, raised, tolerance)
     left, refused = np.arange(n), np.empty(n, np.int64)
     for i in range(2, uniform.shape[1]):
         for j in range(n):
             m = left[j]
-            angle[j] = ends[0, m] + uniform[m, i] * (ends[1, m] - ends[0, m])
+            angle[j] = arcs[0, m] + uniform[m, i] * (arcs[1, m] - arcs[0, m])
             cosine[j], sine[j] = math.cos(np.float32(angle[j])), math.sin(np.float32(angle[j]))
-        surprise = _surprise(circles, raised, cosine[:n], sine[:n], n_others, hard, tolerance)
+        given = circles, raised, ends, floors, cosine[:n], sine[:n]
+        surprise = _surprise(*given, hard, tolerance)
         n_tried, n = n, 0
         for j in range(n_tried):
             m = left[j]
@@ -252,7 +276,7 @@ def _search(
             if power * surprise[j] <= level[m] + meridians * _log(meridian):
                 turn[m] = angle[j]
             else:
-                ends[int(angle[j] > 0), m] = angle[j]
+                arcs[int(angle[j] > 0), m] = angle[j]
                 left[n], refused[n] = m, j
                 n += 1
         if n == 0:
@@ -265,8 +289,8 @@ def _search(
 
 
 @compiled
-def _cut_arcs(ends: Array, circles: Array, raised: Array, tolerance: float) -> None:
-    """Cut arcs with ends (2 M) to where answers without error are possible, see
+def _cut_arcs(arcs: Array, circles: Array, raised: Array, tolerance: float) -> None:
+    """Cut arcs with these ends (2 M) to where answers without error are possible, see
     ``responses.ResponseModel.possible_arc``."""
     n_samples = circles.shape[2]
     # Of one over the tangent of half an angle, as far as each end may go.
@@ -281,28 +305,30 @@ def _cut_arcs(ends: Array, circles: Array, raised: Array, tolerance: float) -> N
             above[m] = max(above[m], (root - q) / room if square > 0 else -math.inf)
             below[m] = max(below[m], (root + q) / room if square > 0 else -math.inf)
     for m in range(n_samples):
-        ends[0, m] = max(ends[0, m], -2 * math.atan2(1.0, below[m]))
-        ends[1, m] = min(ends[1, m], 2 * math.atan2(1.0, above[m]))
+        arcs[0, m] = max(arcs[0, m], -2 * math.atan2(1.0, below[m]))
+        arcs[1, m] = min(arcs[1, m], 2 * math.atan2(1.0, above[m]))
 
 
 @compiled
 def _surprise(
     circles: Array,
     raised: Array,
+    ends: Array,
+    floors: Array,
     cosine: Array,
     sine: Array,
-    n_others: int,
     hard: bool,
     tolerance: float,
 ) -> Array:
     """Minus the log-likelihood (n) of all answers, at a point of each of the first n circles."""
     n = len(cosine)
     total, product = np.zeros(n), np.ones(n)  # the result is total + log(product)
-    highest, terms = np.empty(n), np.empty(n)
-    for h in range(len(raised) // n_others):
+    before, highest, terms = np.zeros(n), np.empty(n), np.empty(n)
+    start, lapses = 0, np.any(floors > 0)
+    for e in range(len(ends)):
         for j in range(n):
             highest[j], terms[j] = 0.0, 1.0
-        for g in range(h * n_others, (h + 1) * n_others):
+        for g in range(start, ends[e]):
             for j in range(n):
                 gap = circles[0, g, j] * cosine[j] + circles[1, g, j] * sine[j] + raised[g]
                 if hard:
@@ -312,12 +338,20 @@ def _surprise(
                     ratio = _exp_minus(abs(gap + highest[j]))
                     terms[j] = terms[j] * ratio + 1.0 if -gap > highest[j] else terms[j] + ratio
                     highest[j] = max(highest[j], -gap)
+        start = ends[e]
         for j in range(n):
             total[j] += highest[j]
             product[j] *= terms[j]
-        if h % 100 == 99:  # before the product overflows
+        if e % 100 == 99 or (lapses and floors[e] >= 0):  # before the product overflows
             for j in range(n):
                 total[j], product[j] = total[j] + math.log(product[j]), 1.0
+        if floors[e] > 0:  # the floor is added to what this answer alone is likely
+            for j in range(n):
+                alone = total[j] - before[j]
+                total[j] = before[j] - math.log(math.exp(-alone) + floors[e])
+        if floors[e] >= 0:
+            for j in range(n):
+                before[j] = total[j]
     for j in range(n):
         total[j] += math.log(product[j])
     return total

@@ -41,12 +41,13 @@ from torchrl.envs import EnvBase
 
 from torchrl_pref.acquisition.functions import information_gain
 from torchrl_pref.acquisition.scoring import score_queries
-from torchrl_pref.beliefs.sampled import Belief, feature_gaps
+from torchrl_pref.beliefs.sampled import Belief
 from torchrl_pref.envs.objectives import make_objective
 from torchrl_pref.envs.state import check_state
 from torchrl_pref.errors import InputError, check_count, check_type
 from torchrl_pref.humans.simulated import SimulatedHuman
 from torchrl_pref.pool import QueryPool
+from torchrl_pref.questions.base import check_same
 from torchrl_pref.tensors import check_range, check_shape
 
 State: TypeAlias = TensorDict | dict[str, Any]
@@ -80,6 +81,7 @@ class SessionEnv(EnvBase):
         check_type("pool", pool, QueryPool, "QueryPool(features)")
         check_type("human", human, SimulatedHuman, "SimulatedHuman(Boltzmann(2.0))")
         check_type("belief", belief, Belief, "Belief(Boltzmann(2.0))")
+        check_same(human.response_model.question, belief.response_model.question)
         check_count("seed", seed, 0)
         super().__init__(device=device, batch_size=torch.Size(batch_size))
         self.register_buffer("features", pool.features.to(device))
@@ -138,8 +140,8 @@ class SessionEnv(EnvBase):
         """New humans who have answered nothing. The draws that strategies share come first."""
         size, n_features = self.batch_size.numel(), self.features.shape[-1]
         rng, device = self.generator, self.device
-        n_options = self.features.shape[1]
-        human = self.human.draw(size, self.budget, n_options, n_features, rng)
+        n_answers = self.human.response_model.n_answers(self.features.shape[1])
+        human = self.human.draw(size, self.budget, n_answers, n_features, rng)
         open_slots = torch.full((size, self.budget), -1, device=device)
         zero = torch.zeros((size, 1), device=device)
         return TensorDict(
@@ -189,9 +191,10 @@ class SessionEnv(EnvBase):
         # On the CPU only as many turns as were taken are worth the work; -1 slots come last.
         taken = int(turn.max())
         past, given = (history[key][:, :taken] for key in ("queries", "answers"))
-        earlier, newest = feature_gaps(self.features[past], given), feature_gaps(queries, answers)
+        options = torch.cat([self.features[past], queries.unsqueeze(1)], 1)
+        evidence = model.evidence(options, torch.cat([given, answers.unsqueeze(1)], 1))
         ess = metrics["ess"].squeeze(-1)
-        update = self.belief.update(samples, ess, earlier, newest, self.generator)
+        update = self.belief.update(samples, ess, evidence, self.generator)
         mean, measured = _measure(update.samples, human["omega"])
         gain = score_queries(samples, queries.unsqueeze(1), model, information_gain)
         place = torch.arange(history["queries"].shape[1], device=turn.device) == turn.unsqueeze(-1)

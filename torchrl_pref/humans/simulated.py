@@ -44,11 +44,11 @@ class SimulatedHuman:
             )
 
     def draw(
-        self, n_sessions: int, budget: int, n_options: int, n_features: int, generator: Generator
+        self, n_sessions: int, budget: int, n_answers: int, n_features: int, generator: Generator
     ) -> TensorDict:
         """Draw B humans: ``omega`` (B D), standard Gumbel ``noise`` (B H R), ``care`` (B 1)."""
         omega = uniform_sphere((n_sessions, n_features), generator)
-        shape = (n_sessions, budget, n_options)
+        shape = (n_sessions, budget, n_answers)
         exponential = torch.empty(shape, device=generator.device).exponential_(generator=generator)
         noise = -exponential.clamp(min=1e-30).log()
         exponent = 2 * torch.rand((n_sessions, 1), generator=generator, device=generator.device) - 1
@@ -58,7 +58,7 @@ class SimulatedHuman:
     def respond(
         self, queries: Tensor, human: TensorDictBase | Mapping[str, Tensor], turn: Tensor
     ) -> Tensor:
-        """Pick one option of a query, by the Gumbel-max trick.
+        """Answer a query, by the Gumbel-max trick.
 
         Args:
             queries: (B K D), features of the options.
@@ -66,7 +66,7 @@ class SimulatedHuman:
             turn: (B), how many queries each human has answered before.
 
         Returns:
-            (B) int64, the index of the chosen option.
+            (B) int64, the index of the answer.
 
         Raises:
             InputError: the returns are not finite.

@@ -1,1 +1,8 @@
-"""What can be answered, and how likely each answer is."""
+"""What can be answered, how likely each answer is, and what it says of ω."""
+
+from torchrl_pref.questions.base import Question
+from torchrl_pref.questions.choice import Choice
+from torchrl_pref.questions.weak import Weak
+
+QUESTIONS: dict[str, type[Question]] = {"choice": Choice, "weak": Weak}
+"""The kinds of question by name."""

@@ -1,6 +1,7 @@
 """Response models: how likely each answer to a query is, given the returns of its options.
 
-Shapes: K options, R possible answers (here R = K), ``…`` any leading dimensions.
+Shapes: K options, R possible answers, H answers given, F factors of an answer, J rows of a factor,
+D features, ``…`` any leading dimensions.
 
 A response model is the one place where a likelihood is written. The belief, the acquisition
 functions, the simulated humans and the calibration of ``tau`` all call it.
@@ -19,8 +20,15 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from torchrl_pref.errors import InputError, check_not_negative, check_positive
-from torchrl_pref.tensors import check_finite, check_plain
+from torchrl_pref.errors import (
+    InputError,
+    check_not_negative,
+    check_positive,
+    check_share,
+    check_type,
+)
+from torchrl_pref.questions.base import Answers, Evidence, Question, answers_on, rows_of
+from torchrl_pref.questions.choice import Choice
 
 MAX_TAU = 1e30
 """Larger and a product with a return is beyond float32; 10⁶ is an optimal user already."""
@@ -36,40 +44,86 @@ class Prediction(NamedTuple):
 
 
 class ResponseModel(ABC):
-    """The probability of an answer. It sees returns only, so it serves any task and any D."""
+    """How a person answers: the kind of question, and how likely each answer is.
+
+    It sees returns only, so it serves any task and any D. Whoever derives from it says by
+    ``log_likelihood`` how the noise works.
+
+    Attributes:
+        question: what can be answered; a choice of one option where nothing else is said.
+        lapse: probability of an answer at random, whatever the returns are.
+        scale: what a return of 1 is in logits, the unit of a question's offsets.
+    """
+
+    question: Question = Choice()
+    lapse: float = 0.0
+    scale: float = 1.0
 
     @abstractmethod
     def log_likelihood(self, gaps: Tensor) -> Tensor:
-        """Log-probability that an option is chosen.
+        """Log-probability of one factor of an answer: that something is preferred to J others.
 
         Args:
-            gaps: (… K-1), by how much the option's return exceeds that of each other option.
+            gaps: (… J), by how much its return exceeds each of theirs.
 
         Returns:
             (…), natural logarithm.
         """
 
-    def joint_log_likelihood(self, gaps: Tensor) -> Tensor:
-        """Log-probability of a whole history of answers.
+    def evidence(self, options: Tensor, answers: Tensor) -> Evidence:
+        """What answers say of ω.
 
         Args:
-            gaps: (… H K-1), as in :meth:`log_likelihood`.
+            options: (… K D), features of the options of each query.
+            answers: (…), index of the answer among the R of the question, -1 where there is none.
+
+        Raises:
+            InputError: an answer is no whole number from -1 to R-1.
+        """
+        rows, offsets = rows_of(self.question, options, answers)
+        floor = torch.zeros_like(answers, dtype=rows.dtype)
+        if self.lapse:
+            table = self._answers(options.shape[-2], options.device)
+            share = self.lapse / (1 - self.lapse) / len(table.labels)
+            floor = share * (-table.log_weights[answers.clamp(min=0)]).exp()
+            floor = floor * (answers >= 0)  # no answer is none by mistake either
+        return Evidence(rows, offsets / self.scale, floor)
+
+    def answer_log_likelihood(self, gaps: Tensor, floor: Tensor) -> Tensor:
+        """Log-probability of an answer, up to a number that does not depend on ω.
+
+        Args:
+            gaps: (… F J), of its factors, raised by their offsets.
+            floor: (…), see :class:`Evidence`.
 
         Returns:
             (…), natural logarithm.
         """
-        return self.log_likelihood(gaps).sum(-1)
+        product = self.log_likelihood(gaps).sum(-1)
+        return torch.logaddexp(product, floor.log()) if self.lapse else product
+
+    def joint_log_likelihood(self, gaps: Tensor, floor: Tensor) -> Tensor:
+        """Log-probability of a whole history of answers, up to a number that does not depend on ω.
+
+        Args:
+            gaps: (… H F J), of the factors of the answers, raised by their offsets.
+            floor: (… H), see :class:`Evidence`.
+
+        Returns:
+            (…), natural logarithm.
+        """
+        return self.answer_log_likelihood(gaps, floor).sum(-1)
 
     def agrees(self, gaps: Tensor) -> Tensor:
-        """Whether the choice of an option is possible, other than as a tie of options that differ.
+        """Whether an answer is possible, other than as a tie of options that differ.
 
         Args:
-            gaps: (… K-1), as in :meth:`log_likelihood`.
+            gaps: (… F J), of its factors.
 
         Returns:
             (…) bool.
         """
-        return self.log_likelihood(gaps) > -math.inf
+        return (self.log_likelihood(gaps) > -math.inf).all(-1)
 
     def possible_arc(self, cosine: Tensor, sine: Tensor, raised: Tensor) -> tuple[Tensor, Tensor]:
         """Ends of the arc around the angle 0 outside of which some answer is impossible.
@@ -84,6 +138,15 @@ class ResponseModel(ABC):
         end = torch.full_like(cosine[0], math.inf)
         return -end, end
 
+    def n_answers(self, n_options: int) -> int:
+        """R, how many answers there are to a query of K options."""
+        return len(self.question.answers(n_options).labels)
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether the question is a choice, answered without lapses: closed forms are for this."""
+        return not self.lapse and type(self.question) is Choice
+
     def __call__(self, returns: Tensor) -> Tensor:
         """Log-probability of each answer.
 
@@ -93,13 +156,18 @@ class ResponseModel(ABC):
         Returns:
             (… R), natural logarithm; each row's exponentials sum to one.
         """
-        columns = returns.unbind(-1)
+        table = self._answers(returns.shape[-1], returns.device)
         log_probs = []
-        for k, chosen in enumerate(columns):
-            others = [chosen - other for j, other in enumerate(columns) if j != k]
-            log_probs.append(self.log_likelihood(torch.stack(others, -1)))
+        for contrasts, offsets, log_weight in zip(*table[1:], strict=True):
+            rows = returns @ contrasts.flatten(0, 1).mT.to(returns)
+            gaps = rows.unflatten(-1, offsets.shape) + offsets / self.scale
+            log_probs.append(self.log_likelihood(gaps).sum(-1) + log_weight)
         # Answers outermost in memory: what follows reduces over samples, one answer at a time.
-        return torch.stack(log_probs).movedim(0, -1)
+        likely = torch.stack(log_probs)
+        if self.lapse:
+            at_random = torch.full_like(likely, math.log(self.lapse / len(likely)))
+            likely = torch.logaddexp(likely + math.log1p(-self.lapse), at_random)
+        return likely.movedim(0, -1)
 
     def predict(self, leads: Tensor) -> Prediction:
         """What M samples of the weights predict of the answer.
@@ -115,6 +183,9 @@ class ResponseModel(ABC):
         entropy = -(probs * log_probs.clamp(min=-1e4)).mean(-2).sum(-1)
         return Prediction(probs, entropy)
 
+    def _answers(self, n_options: int, device: torch.device) -> Answers:
+        return answers_on(self.question, n_options, device)
+
 
 @final
 class Boltzmann(ResponseModel):
@@ -125,18 +196,23 @@ class Boltzmann(ResponseModel):
 
     Args:
         tau: what the returns are multiplied by; above 0. Larger is less noisy.
+        question: the kind of question; by default a choice of one option.
+        lapse: probability of an answer at random, from 0 to below 1.
 
     Raises:
-        InputError: ``tau`` is not a finite number above zero, or beyond float32.
+        InputError: ``tau`` is not a finite number above zero, or beyond float32, or the lapse rate
+            is no such probability.
     """
 
     def __init_subclass__(cls, **_: Any) -> None:
         _refuse_subclass(cls, Boltzmann)
 
-    def __init__(self, tau: float) -> None:
-        self.tau = check_positive("tau", tau)
+    def __init__(self, tau: float, question: Question | None = None, lapse: float = 0.0) -> None:
+        self.tau = self.scale = check_positive("tau", tau)
         if self.tau > MAX_TAU:
             raise InputError(f"tau={tau!r}: expected at most {MAX_TAU:g}; use Optimal() instead")
+        self.question = _check_question(question)
+        self.lapse = _check_lapse(lapse)
 
     def log_likelihood(self, gaps: Tensor) -> Tensor:
         """See :meth:`ResponseModel.log_likelihood`."""
@@ -144,24 +220,24 @@ class Boltzmann(ResponseModel):
             return F.logsigmoid(self.tau * gaps.squeeze(-1))
         return -torch.logsumexp(F.pad(-self.tau * gaps, (1, 0)), -1)
 
-    def joint_log_likelihood(self, gaps: Tensor) -> Tensor:
+    def joint_log_likelihood(self, gaps: Tensor, floor: Tensor) -> Tensor:
         """See :meth:`ResponseModel.joint_log_likelihood`."""
-        if gaps.shape[-1] > 1:
-            return super().joint_log_likelihood(gaps)
+        if gaps.shape[-1] > 1 or self.lapse:
+            return super().joint_log_likelihood(gaps, floor)
         # log σ(z) = min(z, 0) + log σ(|z|)
-        logit = self.tau * gaps.squeeze(-1)
+        logit = self.tau * gaps.flatten(-3)
         return logit.clamp(max=0).sum(-1) + sum_of_logs(logit.abs().sigmoid_())
 
     def __call__(self, returns: Tensor) -> Tensor:
         """See :meth:`ResponseModel.__call__`."""
-        if returns.shape[-1] == 2:
+        if returns.shape[-1] == 2 or not self.is_plain:
             return super().__call__(returns)
         # The same for all K options at once, in K exponentials and not K².
         return torch.log_softmax(self.tau * returns.movedim(-1, 0), 0).movedim(0, -1)
 
     def predict(self, leads: Tensor) -> Prediction:
         """See :meth:`ResponseModel.predict`."""
-        if leads.shape[-1] > 1:
+        if leads.shape[-1] > 1 or not self.is_plain:
             return super().predict(leads)
         # With q the probability of the less likely answer and z the logit, the entropy is
         # |z| q - log(1 - q): no logarithm of each sample, and no term that can cancel another.
@@ -174,7 +250,7 @@ class Boltzmann(ResponseModel):
         return Prediction(probs, entropy)
 
     def __repr__(self) -> str:
-        return f"Boltzmann(tau={self.tau:g})"
+        return f"Boltzmann(tau={self.tau:g}{_beside(self)})"
 
 
 @final
@@ -184,16 +260,19 @@ class Optimal(ResponseModel):
     Args:
         tolerance: gaps this small count as ties. It absorbs the rounding of float32 returns, so a
             belief never excludes the very human who answered. In the units of the return.
+        lapse: probability of an answer at random, from 0 to below 1.
 
     Raises:
-        InputError: ``tolerance`` is not a finite number of at least zero.
+        InputError: ``tolerance`` is not a finite number of at least zero, or the lapse rate is no
+            such probability.
     """
 
     def __init_subclass__(cls, **_: Any) -> None:
         _refuse_subclass(cls, Optimal)
 
-    def __init__(self, tolerance: float = 1e-6) -> None:
+    def __init__(self, tolerance: float = 1e-6, lapse: float = 0.0) -> None:
         self.tolerance = check_not_negative("tolerance", tolerance)
+        self.lapse = _check_lapse(lapse)
 
     def log_likelihood(self, gaps: Tensor) -> Tensor:
         """See :meth:`ResponseModel.log_likelihood`."""
@@ -203,10 +282,12 @@ class Optimal(ResponseModel):
 
     def agrees(self, gaps: Tensor) -> Tensor:
         """See :meth:`ResponseModel.agrees`: two that differ are never quite equal."""
-        return (gaps > self.tolerance).all(-1)
+        return (gaps > self.tolerance).all(-1).all(-1) | bool(self.lapse)
 
     def possible_arc(self, cosine: Tensor, sine: Tensor, raised: Tensor) -> tuple[Tensor, Tensor]:
         """See :meth:`ResponseModel.possible_arc`."""
+        if self.lapse:
+            return super().possible_arc(cosine, sine, raised)
         raised = raised + self.tolerance
         # p cos θ + q sin θ + c is zero where tan(θ/2) = (p + c) / (± √(q² + p² - c²) - q).
         square = sine.square() + cosine.square() - raised.square()
@@ -221,14 +302,44 @@ class Optimal(ResponseModel):
 
     def predict(self, leads: Tensor) -> Prediction:
         """See :meth:`ResponseModel.predict`."""
-        if leads.shape[-1] > 1:
+        if leads.shape[-1] > 1 or not self.is_plain:
             return super().predict(leads)
         winner = F.hardshrink(leads.squeeze(-1), self.tolerance).sign()  # 1, -1, or 0 for a tie
         entropy = math.log(2) * (1 - winner.abs().mean(-1))
         return Prediction(torch.stack([winner + 1, 1 - winner]).movedim(0, -1) / 2, entropy)
 
     def __repr__(self) -> str:
-        return "Optimal()"
+        return f"Optimal({_beside(self)[2:]})"
+
+
+def _check_question(question: Any) -> Question:
+    """A choice where there is none.
+
+    Raises:
+        InputError: it is no kind of question.
+    """
+    if question is None:
+        return Choice()
+    check_type("question", question, Question, "Choice() or Weak(1.0)")
+    assert isinstance(question, Question)
+    return question
+
+
+def _check_lapse(lapse: Any) -> float:
+    """The lapse rate.
+
+    Raises:
+        InputError: it is no number from 0 to below 1.
+    """
+    if check_share("lapse", lapse) == 1:
+        raise InputError("lapse=1: expected below 1, or the answers would say nothing of ω")
+    return float(lapse)
+
+
+def _beside(model: ResponseModel) -> str:
+    """What a model's name says beside its tau."""
+    question = "" if type(model.question) is Choice else f", {model.question!r}"
+    return question + (f", lapse={model.lapse:g}" if model.lapse else "")
 
 
 def compiled_constants(response_model: ResponseModel) -> tuple[float, float] | None:
@@ -267,40 +378,3 @@ def sum_of_logs(probs: Tensor) -> Tensor:
     whole = probs.shape[-1] // 64 * 64
     products = probs[..., :whole].unflatten(-1, (-1, 64)).prod(-1)
     return products.log().sum(-1) + probs[..., whole:].prod(-1).log()
-
-
-def calibrate_tau(returns: Tensor, target: float = 0.9) -> float:
-    """The tau at which the best option is picked with probability ``target`` on average.
-
-    This is what "noisy user (90%)" of the paper's Figure 1 is taken to mean.
-
-    Args:
-        returns: (… K), returns of the options of the training pool under humans of the prior.
-        target: mean probability of the best option, above 1/K and below 1.
-
-    Raises:
-        InputError: the returns are no finite numbers of K ≥ 2 options, or no tau up to 10⁶ reaches
-            the target (most options tie).
-    """
-    check_plain("returns", returns)
-    if returns.ndim < 1 or returns.shape[-1] < 2 or not returns.numel():
-        raise InputError(
-            f"returns of shape {tuple(returns.shape)}: expected (… K), at least one row of at "
-            "least 2 options"
-        )
-    check_finite("returns", returns.to(torch.float32))
-    gaps = (returns.amax(-1, keepdim=True) - returns).sort(-1).values[..., 1:]
-
-    def accuracy(tau: float) -> float:
-        return Boltzmann(tau).log_likelihood(gaps).exp().mean(dtype=torch.float64).item()
-
-    low, high = 1e-6, 1e6
-    if not accuracy(low) < target < accuracy(high):
-        raise InputError(
-            f"an accuracy of {target} cannot be reached: tau between {low:g} and {high:g} gives "
-            f"{accuracy(low):.3f} to {accuracy(high):.3f}; give tau as a number"
-        )
-    while high / low > 1 + 1e-6:
-        middle = math.sqrt(low * high)
-        low, high = (middle, high) if accuracy(middle) < target else (low, middle)
-    return math.sqrt(low * high)

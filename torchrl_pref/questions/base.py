@@ -1,0 +1,150 @@
+"""Kinds of question: what can be answered, and what each answer says of ω.
+
+Letters: K options per query, R possible answers, F factors of an answer, J rows of a factor, D
+features, ``…`` any leading dimensions.
+
+Every answer is evidence of one form: a product of F softmax choices, in each of which something was
+preferred to J others (reward-rational choice: Jeon, Milli and Dragan, 2020). A row is what the
+preferred one's features are more than another's, and an offset makes the preference easier to give.
+With r the return of a row and o its offset, a factor of a Boltzmann human is
+
+    1 / (1 + Σ_j exp(-tau (r_j + o_j))).
+
+A kind of question is a table of numbers, so that the belief, the acquisition functions, the
+simulated humans and the compiled loops know all kinds alike.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrl_pref.errors import InputError
+from torchrl_pref.tensors import check_range
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What answers say of ω, under a response model.
+
+    Attributes:
+        rows: (… F J D), features of what was preferred less those of what it was preferred to.
+        offsets: (… F J), what is added to the returns of the rows, in their unit; infinite where
+            there is no row, as where there is no answer yet.
+        floor: (…), what is added to the product of the factors: 0, or more where anything may be
+            answered by mistake.
+    """
+
+    rows: Tensor
+    offsets: Tensor
+    floor: Tensor
+
+    def __getitem__(self, index: Any) -> Evidence:
+        """The evidence of some of the answers, by an index of the leading dimensions."""
+        return Evidence(self.rows[index], self.offsets[index], self.floor[index])
+
+    @staticmethod
+    def cat(parts: Sequence[Evidence], dim: int) -> Evidence:
+        """Evidence one after the other, along one of the leading dimensions."""
+        fields = ((part.rows, part.offsets, part.floor) for part in parts)
+        return Evidence(*(torch.cat(field, dim) for field in zip(*fields, strict=True)))
+
+    def expand(self, *leading: int) -> Evidence:
+        """The same evidence for more leading dimensions, as views."""
+        return Evidence(
+            self.rows.expand(*leading, *self.rows.shape[-3:]),
+            self.offsets.expand(*leading, *self.offsets.shape[-2:]),
+            self.floor.expand(*leading),
+        )
+
+    def double(self) -> Evidence:
+        """The same in float64."""
+        return Evidence(self.rows.double(), self.offsets.double(), self.floor.double())
+
+    def gaps(self, samples: Tensor) -> Tensor:
+        """Return gaps (S M … F J) under samples (S M D), raised by the offsets."""
+        rows = (samples @ self.rows.flatten(1, -2).mT).unflatten(-1, self.rows.shape[1:-1])
+        return rows + self.offsets.unsqueeze(1)
+
+
+class Answers(NamedTuple):
+    """The possible answers to a query of K options."""
+
+    labels: tuple[str, ...]
+    """R, what each is called."""
+    contrasts: Tensor
+    """(R F J K), by what the options' features are multiplied to make the rows."""
+    offsets: Tensor
+    """(R F J), in logits; infinite where there is no row."""
+    log_weights: Tensor
+    """(R), natural logarithm of what the product of an answer's factors is multiplied by."""
+
+
+class Question(ABC):
+    """A kind of question. Two of the same kind with the same numbers are equal."""
+
+    @abstractmethod
+    def answers(self, n_options: int) -> Answers:
+        """What can be answered to a query of K options.
+
+        Raises:
+            InputError: there is no such question about so many options.
+        """
+
+    def __eq__(self, other: object) -> bool:
+        return type(self) is type(other) and vars(self) == vars(other)
+
+    def __hash__(self) -> int:
+        return hash((type(self), *sorted(vars(self).items())))
+
+    def __repr__(self) -> str:
+        numbers = ", ".join(f"{name}={value}" for name, value in vars(self).items())
+        return f"{type(self).__name__}({numbers})"
+
+
+@lru_cache(maxsize=64)
+def answers_on(question: Question, n_options: int, device: torch.device) -> Answers:
+    """A question's possible answers, their tensors on a device."""
+    labels, *tensors = question.answers(n_options)
+    return Answers(labels, *(tensor.to(device) for tensor in tensors))
+
+
+def rows_of(question: Question, options: Tensor, answers: Tensor) -> tuple[Tensor, Tensor]:
+    """Rows (… F J D) and offsets (… F J) in logits of answers (…) to queries (… K D).
+
+    Args:
+        question: the kind of question.
+        options: (… K D), features.
+        answers: (…), indices of the question's answers, -1 where there is none.
+
+    Raises:
+        InputError: an answer is no whole number from -1 to R-1.
+    """
+    table = answers_on(question, options.shape[-2], options.device)
+    last = len(table.labels) - 1
+    answers = check_range("answers", answers, -1, last, f"{table.labels}, -1 where none")
+    there = (answers >= 0)[..., None, None]
+    given = answers.clamp(min=0)
+    # A sum and no matrix product: each row is the difference of a few numbers, exactly.
+    rows = (table.contrasts[given].unsqueeze(-1) * options[..., None, None, :, :]).sum(-2)
+    offsets = torch.where(there, table.offsets[given], torch.inf)
+    return rows * there.unsqueeze(-1), offsets
+
+
+def check_same(human: Question, belief: Question) -> None:
+    """Refuse a human and a belief who are not asked the same.
+
+    Raises:
+        InputError: the answers of one are not those of the other.
+    """
+    if type(human) is not type(belief):
+        raise InputError(
+            f"the human answers {human!r} and the belief expects {belief!r}: expected the same "
+            "kind of question; their numbers may differ"
+        )

@@ -25,8 +25,9 @@ from torchrl_pref.runs import CHECKPOINT
 
 if TYPE_CHECKING:
     from torchrl_pref.checkpoints.checkpoint import Checkpoint
-    from torchrl_pref.evaluation.comparison import Panels
-    from torchrl_pref.training.progress import Progress
+    from torchrl_pref.evaluation.own import Maker
+    from torchrl_pref.evaluation.records import Records
+    from torchrl_pref.training.figure import Training
 
 PROTOCOL_KEYS = (
     "checkpoint",
@@ -36,11 +37,14 @@ PROTOCOL_KEYS = (
     "hydra.",
     "setup.budget",
     "setup.offers",
+    "strategy",
     "belief.",
     "task.",
     "pool.size",
     "pool.options",
     "pool.seed",
+    "pool.train",
+    "pool.test",
 )
 """What may be typed beside ``protocol``; the rest is the protocol's own."""
 
@@ -82,11 +86,12 @@ def check(settings: dict[str, Any]) -> None:
                 "policy=pretrained and checkpoint=… name two policies; expected one of "
                 "them; pretrained policies are files too: checkpoint=[a.pt,b.pt]"
             )
-        allowed = ("evaluation.", "pool.test", "device", "threads", "hydra.")
+        allowed = ("evaluation.", "pool.test", "strategy", "device", "threads", "hydra.")
         typed.refuse_other_overrides("checkpoint", allowed)
     check_evaluate_settings(settings)
     app.allow_typed(settings)
     app.check_groups(settings)
+    own_strategies(settings)
 
 
 def evaluate(settings: dict[str, Any], folder: Path) -> None:
@@ -95,19 +100,18 @@ def evaluate(settings: dict[str, Any], folder: Path) -> None:
     from torchrl_pref.training import figure
 
     app.use_threads(settings)
-    named = settings["checkpoint"]
+    trained: list[Training] = []
     if settings["protocol"] is not None:
-        run_heldout(settings, folder)
+        records = run_heldout(settings)
     elif "policy" in settings:
-        panels = evaluate_taus(settings, partial(pretrained_for, settings))
-        reports.write_report(folder, panels)
-    elif named is None:
-        reports.write_report(folder, evaluate_taus(settings, lambda tau: {}))
+        records = evaluate_taus(settings, partial(pretrained_for, settings))
+    elif settings["checkpoint"] is None:
+        records = evaluate_taus(settings, lambda tau: {})
     else:
-        paths = find_checkpoints([str(name) for name in listed(named)])
-        panels, trained = evaluate_checkpoints(settings, paths)
-        reports.write_report(folder, panels)
-        figure.write_training(folder, trained)
+        paths = find_checkpoints([str(name) for name in listed(settings["checkpoint"])])
+        records, trained = evaluate_checkpoints(settings, paths)
+    reports.write_report(folder, records)
+    figure.write_training(folder, trained)
 
 
 def listed(value: Any) -> list[Any]:
@@ -115,52 +119,70 @@ def listed(value: Any) -> list[Any]:
     return value if isinstance(value, list) else [value]
 
 
+def own_strategies(settings: dict[str, Any]) -> dict[str, Maker]:
+    """What makes the strategies that the user typed.
+
+    Raises:
+        InputError: there is no such module or name, or it cannot be called.
+    """
+    if settings["strategy"] is None:
+        return {}
+    from torchrl_pref.evaluation.own import find_makers
+
+    return find_makers(listed(settings["strategy"]))
+
+
 def evaluate_taus(
     settings: dict[str, Any], learned_for: Callable[[Any], dict[str, Checkpoint]]
-) -> Panels:
-    """The baselines and what was learned for each tau, a panel each."""
+) -> Records:
+    """The baselines and what was learned for each tau, a task each."""
     from torchrl_pref import build
     from torchrl_pref.evaluation import comparison
+    from torchrl_pref.evaluation.records import Records
 
     pools = build.make_pools(settings)
     taus = listed(settings["tau"])
     tasks = [(build.make_task(*pools, tau, settings), learned_for(tau)) for tau in taus]
-    panels: Panels = {}
+    own, records = own_strategies(settings), Records()
+    for task, _ in tasks:
+        comparison.try_strategies(own, settings, task)
     for task, learned in tasks:
-        panels |= comparison.evaluate_panels(settings, task, learned)
-    return panels
+        records.entries += comparison.evaluate_task(settings, task, learned, own=own).entries
+    return records
 
 
 def pretrained_for(settings: dict[str, Any], tau: Any) -> dict[str, Checkpoint]:
     """The policy that comes with the package for a tau, under the settings of this evaluation."""
-    from torchrl_pref.evaluation.comparison import label_of
+    from torchrl_pref.evaluation.comparison import policy_key
     from torchrl_pref.pretrained import pretrained_checkpoint
 
     checkpoint = pretrained_checkpoint(settings["setup"]["name"], tau)
     for section in ("setup", "belief", "skip", "human", "question", "device"):
         checkpoint.settings[section] = settings[section]
-    return {f"{label_of(checkpoint.settings)} (pretrained)": checkpoint}
+    return {f"{policy_key(checkpoint.settings)}:pretrained": checkpoint}
 
 
-def run_heldout(settings: dict[str, Any], folder: Path) -> None:
+def run_heldout(settings: dict[str, Any]) -> Records:
     """The held-out protocol, for checkpoints or for the policies that come with the package."""
     from torchrl_pref.checkpoints.checkpoint import Checkpoint
-    from torchrl_pref.evaluation import heldout, heldout_report
+    from torchrl_pref.evaluation import heldout
+    from torchrl_pref.evaluation.heldout_pool import Cell
     from torchrl_pref.pretrained import SEEDS, pretrained_checkpoint
 
-    learned: dict[heldout.Cell, list[Checkpoint]] = {}
+    learned: dict[Cell, list[Checkpoint]] = {}
     if settings["checkpoint"] is None:
         for setup, tau in product(("query", "feed"), ("noisy", "optimal")):
-            learned[heldout.Cell(setup, tau)] = [
+            learned[Cell(setup, tau)] = [
                 pretrained_checkpoint(setup, tau, seed) for seed in range(SEEDS)
             ]
     else:
         for path in find_checkpoints([str(name) for name in listed(settings["checkpoint"])]):
             checkpoint = Checkpoint.load(path)
-            cell = heldout.Cell(checkpoint.settings["setup"]["name"], checkpoint.settings["tau"])
+            cell = Cell(checkpoint.settings["setup"]["name"], checkpoint.settings["tau"])
             learned.setdefault(cell, []).append(checkpoint)
-    results = heldout.run_protocol(settings, learned, settings["workers"])
-    heldout_report.write_heldout(folder, results)
+    return heldout.run_protocol(
+        settings, learned, settings["workers"], list(own_strategies(settings))
+    )
 
 
 def find_checkpoints(named: list[str]) -> list[Path]:
@@ -184,13 +206,15 @@ def find_checkpoints(named: list[str]) -> list[Path]:
 
 def evaluate_checkpoints(
     settings: dict[str, Any], paths: list[Path]
-) -> tuple[Panels, dict[str, Progress]]:
-    """Learned policies beside random and greedy, a panel for each kind of human, and the trainings
+) -> tuple[Records, list[Training]]:
+    """Learned policies beside random and greedy, a task for each kind of human, and the trainings
     behind them."""
     from torchrl_pref import build
     from torchrl_pref.checkpoints.checkpoint import Checkpoint
     from torchrl_pref.evaluation import comparison
+    from torchrl_pref.evaluation.records import Records
     from torchrl_pref.pool import QueryPool
+    from torchrl_pref.training.figure import Training
     from torchrl_pref.training.progress import Progress
 
     runs = []
@@ -204,18 +228,18 @@ def evaluate_checkpoints(
         named = path.parent if path.name == CHECKPOINT else path.with_suffix("")
         name = str(named.relative_to(common))
         runs.append((name, checkpoint, build.reload_task(checkpoint, *pools)))
-    panels: Panels = {}
-    for panel_settings, task, learned in comparison.group_checkpoints(runs):
+    own, groups = own_strategies(settings), comparison.group_checkpoints(runs)
+    for its_settings, task, _ in groups:
+        comparison.try_strategies(own, its_settings, task)
+    records, trained = Records(), []
+    for its_settings, task, learned in groups:
         test = None
         if settings["pool"]["test"] is not None:
             test = QueryPool.load(settings["pool"]["test"]).map_features(task.normalizer)
-        panels |= comparison.evaluate_panels(panel_settings, task, learned, test)
-    titles = [f"{comparison.label_of(c.settings)}, {task.title}" for _, c, task in runs]
-    trained = {}
-    for title, (name, checkpoint, _) in zip(titles, runs, strict=True):
-        unique = title if titles.count(title) == 1 else f"{title}, {name}"
-        trained[unique] = Progress.of(checkpoint.training)
-    return panels, trained
+        records.entries += comparison.evaluate_task(its_settings, task, learned, test, own).entries
+        for key, checkpoint in learned.items():
+            trained.append(Training(key, task.title, Progress.of(checkpoint.training)))
+    return records, trained
 
 
 if __name__ == "__main__":

@@ -256,13 +256,12 @@ def train(folder: Path, settings: dict[str, Any], task: Task, trainer: Trainer) 
 
     measure = LearningCurve(settings, task, trainer).measure
     trainer.run(folder, save, measure, settings["logger"])
-    label = comparison.label_of(settings)
-    learned = {label: make_checkpoint(settings, task, trainer)}
-    panels = comparison.evaluate_panels(settings, task, learned)
-    reports.write_report(folder, panels)
-    figure.write_training(folder, {label: trainer.progress})
-    held_out = next(iter(panels.values()))[label]
-    return sweeps.write_summary(folder, settings["overrides"], held_out)
+    key = comparison.policy_key(settings)
+    learned = {key: make_checkpoint(settings, task, trainer)}
+    records = comparison.evaluate_task(settings, task, learned)
+    reports.write_report(folder, records)
+    figure.write_training(folder, [figure.Training(key, task.title, trainer.progress)])
+    return sweeps.write_summary(folder, settings["overrides"], records, key)
 
 
 if __name__ == "__main__":

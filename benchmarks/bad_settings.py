@@ -311,7 +311,7 @@ def _import_heavy() -> None:
     """Once, and not in each fork."""
     import torch
 
-    import torchrl_pref.evaluation.heldout_report  # noqa: F401
+    import torchrl_pref.evaluation.reports  # noqa: F401
 
     torch.set_num_threads(1)
 
@@ -353,7 +353,7 @@ def _stop_at_work() -> None:
         os._exit(STARTED)
 
     Trainer.run = stop  # type: ignore[assignment, method-assign]
-    comparison.evaluate_panels = stop  # type: ignore[assignment]
+    comparison.evaluate_task = stop  # type: ignore[assignment]
     heldout.run_protocol = stop  # type: ignore[assignment]
     memory.machine_memory = lambda: LIMIT_BYTES
 

@@ -38,10 +38,11 @@ from torchrl_pref.checkpoints.checkpoint import Checkpoint
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.evaluation.comparison import FIRST_EVALUATION_SEED
-from torchrl_pref.evaluation.heldout import Cell, run_side_by_side
-from torchrl_pref.evaluation.reports import signed
+from torchrl_pref.evaluation.heldout_pool import Cell
 from torchrl_pref.evaluation.run import draw_humans
-from torchrl_pref.evaluation.statistics import two_way_interval
+from torchrl_pref.evaluation.side_by_side import Entrant, run_side_by_side
+from torchrl_pref.evaluation.statistics import bootstrap_interval
+from torchrl_pref.evaluation.tables import signed, title_of
 from torchrl_pref.pretrained import SEEDS, pretrained_checkpoint
 
 FIRST_SEED = FIRST_EVALUATION_SEED + 60_000
@@ -106,8 +107,8 @@ def run_pool(job: Job) -> list[list[list[float]]]:
     env = make_env(job.humans)
     mine = {run: Checkpoint.load(run) for run in job.runs}
     times = math.ceil(SEEDS / len(mine))
-    lineup = [(run, load_policy(one, env).strategy) for run, one in mine.items()] * times
-    lineup += [("shipped", load_policy(one, env).strategy) for one in shipped]
+    lineup = [Entrant(run, load_policy(one, env).strategy) for run, one in mine.items()] * times
+    lineup += [Entrant("shipped", load_policy(one, env).strategy) for one in shipped]
     results = run_side_by_side(make_env, draw_humans(env), lineup)
     curves = [torch.stack([one.alignment for one in results[run]]).mean((0, 1)) for run in mine]
     beside = [one.alignment.mean(0) for one in results["shipped"]]
@@ -117,9 +118,9 @@ def run_pool(job: Job) -> list[list[list[float]]]:
 def row_of(cell: Cell, mine: Tensor, shipped: Tensor) -> common.Row:
     """One line of the table, from alignments (P S 2) of the runs and of the package's policies."""
     apart = mine - shipped.mean(1, keepdim=True)
-    row: common.Row = {"cell": cell.title, "runs": mine.shape[1]}
+    row: common.Row = {"cell": title_of(cell.task), "runs": mine.shape[1]}
     for number, what in enumerate(("last", "mean of 1 to H")):
-        interval = two_way_interval(apart[..., number])
+        interval = bootstrap_interval(apart[..., number])
         row[what] = f"{mine[..., number].mean():.4f}"
         row[f"minus the package's, {what}"] = signed(float(apart[..., number].mean()), interval)
         if number == 0:

@@ -20,7 +20,7 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 from torchrl_pref.build import make_pools, make_task
-from torchrl_pref.evaluation.comparison import compare, label_of
+from torchrl_pref.evaluation.comparison import compare, policy_key
 from torchrl_pref.pretrained import pretrained_checkpoint
 from torchrl_pref.training.start import make_trainer
 
@@ -31,6 +31,16 @@ CELLS = [(setup, tau) for setup in ("query", "feed") for tau in ("noisy", "optim
 
 SMALL = ["pool.size=150", "setup.budget=6", "evaluation.humans=40"]
 SHORT = ["training.updates=6", "training.sessions=12", "training.warm_up=1"]
+
+WRITTEN_AS = {
+    "greedy_information": "greedy",
+    "greedy_alignment": "greedy alignment",
+    "ask_all": "ask all",
+    "quantile_alignment": "quantile",
+    "policy_query": "RL",
+    "policy_feed": "RL-feed",
+}
+"""What the file, which is as it was, calls the strategies."""
 
 
 def main() -> None:
@@ -69,15 +79,15 @@ def evaluated(setup: str, tau: str) -> dict[str, dict[str, Any]]:
     checkpoint.settings["setup"]["budget"] = settings["setup"]["budget"]
     if setup == "feed":
         checkpoint.settings["setup"]["offers"] = settings["setup"]["offers"]
-    results = compare(settings, task, task.test, {label_of(settings): checkpoint})
+    results = compare(settings, task, task.test, {policy_key(settings): checkpoint})
     return {
-        name: {
+        WRITTEN_AS.get(key, key): {
             "alignment": float(result.alignment[:, -1].mean()),
             "digest": digest(
                 result.alignment, result.alignment_of_mean, result.information, result.ess
             ),
         }
-        for name, result in results.items()
+        for key, result in results.items()
     }
 
 

@@ -60,7 +60,7 @@ def test_train_evaluate_and_resume(tmp_path: Path) -> None:
     with (folder / "training.csv").open() as file:
         assert [int(row["update"]) for row in csv.DictReader(file)] == [0, 1, 2, 3]
     assert list((folder / "tensorboard").glob("events*"))
-    for row in ("random", "greedy information gain", "ask all (feed)", "RL-feed"):
+    for row in ("random", "greedy information gain", "ask all", "RL-feed"):
         assert re.search(rf"^{re.escape(row)} +-?\d\.\d+ +-?\d\.\d+ +-?\d\.\d+", output, re.M)
     assert "noisy user (tau=" in output
     assert "only the critic learns in the first training.warm_up=10 updates" in output
@@ -167,7 +167,8 @@ def test_evaluate_compares_the_baselines(tmp_path: Path) -> None:
     with (tmp_path / "curves.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert {row["metric"] for row in rows} >= {"alignment", "alignment_of_mean", "information"}
-    assert len({row["panel"] for row in rows}) == 2
+    assert len({row["task"] for row in rows}) == 2
+    assert (tmp_path / "records.csv.gz").exists()
 
 
 @pytest.mark.parametrize("example", sorted((ROOT / "examples").glob("*.py")), ids=lambda p: p.stem)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from torchrl_pref.beliefs.sampled import Belief
+    from torchrl_pref.build import load_policy
     from torchrl_pref.envs.feed import FeedEnv
     from torchrl_pref.envs.objectives import alignment
     from torchrl_pref.envs.query import QueryEnv
@@ -37,10 +38,12 @@ __all__ = [
     "alignment",
     "calibrate_tau",
     "gridworld_pool",
+    "load_policy",
 ]
 
 _MODULES = {
     "beliefs.sampled": ("Belief",),
+    "build": ("load_policy",),
     "envs.feed": ("FeedEnv",),
     "envs.objectives": ("alignment",),
     "envs.query": ("QueryEnv",),

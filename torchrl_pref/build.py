@@ -308,12 +308,33 @@ def load_weights(policy: Policy, checkpoint: Checkpoint) -> None:
     restore_weights(policy.weights, checkpoint.weights)
 
 
-def load_policy(checkpoint: Checkpoint, env: EnvBase) -> Policy:
-    """A trained policy, to fit an environment.
+def load_policy(checkpoint: Checkpoint | str | Path, env: EnvBase) -> Policy:
+    """A trained policy, to fit an environment; ``env.rollout(20, policy.strategy)`` lets it ask.
+
+    Args:
+        checkpoint: one that is loaded, or its file, or the folder of a run.
+        env: where it is to ask, on any pool that it fits; a pool of raw features is best normalised
+            by the checkpoint's own ``normalizer``.
 
     Raises:
-        InputError: its weights do not fit.
+        InputError: the file cannot be used, the policy was trained in the other setup or with other
+            skips, or the pool or the weights do not fit.
     """
+    if not isinstance(checkpoint, Checkpoint):
+        checkpoint = Checkpoint.load(checkpoint)
+    settings = checkpoint.settings
+    setup = "feed" if is_feed(env) else "query"
+    if settings["setup"]["name"] != setup:
+        raise InputError(
+            f"a policy of setup={settings['setup']['name']} cannot decide in a {setup} environment; "
+            "expected one of the setup that it was trained in"
+        )
+    if setup == "feed" and settings["skip"] != env.skip:
+        raise InputError(
+            f"skip={env.skip!r}: the policy was trained with skip={settings['skip']!r}; make the "
+            f"environment with skip={settings['skip']!r}"
+        )
+    checkpoint.check_fits(QueryPool(env.features))
     policy = make_policy(checkpoint.settings, env)
     load_weights(policy, checkpoint)
     return policy

@@ -112,16 +112,28 @@ def load(what: str, reference: str) -> Callable[..., Any]:
     Raises:
         InputError: there is no such module or name, or what it names cannot be called.
     """
-    module, _, name = reference.partition(":")
-    if os.getcwd() not in sys.path:
-        sys.path.insert(0, os.getcwd())
+    here = os.getcwd()
+    if here not in sys.path:
+        sys.path.append(here)  # not first: a file of the user's must not hide a module of ours
+    module_name, _, name = reference.partition(":")
     try:
-        found = getattr(import_module(module), name)
-    except (ImportError, AttributeError, SyntaxError, ValueError) as error:
+        module = import_module(module_name)
+    except (Exception, SystemExit) as error:
+        # Of packages on the way, too.
+        missing = error.name if isinstance(error, ModuleNotFoundError) else None
+        if missing is not None and f"{module_name}.".startswith(f"{missing}."):
+            raise InputError(
+                f"{what}: no module {module_name} in {here} or among what is installed; expected "
+                "<module>:<name>; check the spelling, or change the folder"
+            ) from None
         raise InputError(
-            f"{what}: cannot be imported ({type(error).__name__}: {error}); expected a module in "
-            "this folder or installed, and the name of a class or function in it"
-        ) from None
+            f"{what}: importing {module_name} fails ({type(error).__name__}: {error}); mend it"
+        ) from error
+    found = getattr(module, name, None)
     if not callable(found):
-        raise InputError(f"{what}: {type(found).__name__}; expected a class or a function")
+        kind = f"is of type {type(found).__name__}" if hasattr(module, name) else "is not there"
+        raise InputError(
+            f"{what}: {name} of {getattr(module, '__file__', module_name)} {kind}; expected a "
+            "function or a class"
+        )
     return found

@@ -187,6 +187,34 @@ class Normalizer:
             )
         return cls(mean.float(), std.float())
 
+    def save(self, path: str | Path) -> None:
+        """Write the normaliser to a file, whole or not at all."""
+        content = {"mean": without_rest(self.mean), "std": without_rest(self.std)}
+        save_atomically({"kind": "normalizer", **content}, path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Normalizer:
+        """Read a normaliser from a file. No pickled code is ever executed.
+
+        Raises:
+            InputError: the file is missing, cut off, spoiled, or not a normaliser.
+        """
+        content = load_safely(path, "normalizer")
+        mean: Any = content.get("mean")
+        std: Any = content.get("std")
+        for value in (mean, std):
+            if not is_dense(value) or value.dtype != torch.float32 or value.ndim != 1:
+                raise InputError(
+                    f"{path}: a normaliser without the mean and the deviation of each feature; "
+                    "make it again with save()"
+                )
+        if mean.shape != std.shape or not (mean.isfinite() & std.isfinite() & (std > 0)).all():
+            raise InputError(
+                f"{path}: a normaliser whose numbers no features can have: expected as many means "
+                "as deviations, finite, and these above 0; make it again with save()"
+            )
+        return cls(mean, std)
+
     def __call__(self, features: Tensor) -> Tensor:
         """Normalise raw features (… D).
 

@@ -52,11 +52,6 @@ def pretrained_policy(env: EnvBase, tau: str, seed: int = 0) -> Policy:
         InputError: there is no such policy, or the feed's skips are not free.
     """
     setup = "feed" if is_feed(env) else "query"
-    if setup == "feed" and env.skip != "free":
-        raise InputError(
-            f"skip={env.skip!r}: a pretrained feed policy was trained with free skips and a budget "
-            'of asks; make the environment with skip="free"'
-        )
     return load_policy(pretrained_checkpoint(setup, tau, seed), env)
 
 

@@ -20,27 +20,34 @@ from torchrl_pref.errors import InputError, one_line
 from torchrl_pref.storage.writing import replacing, write_text
 
 if TYPE_CHECKING:
-    from torchrl_pref.evaluation.run import Evaluation
+    from torchrl_pref.evaluation.records import Records
 
 SUMMARY, FAILED, TABLE = "summary.json", "failed.json", "summary.csv"
 
 Row = dict[str, Any]
 
 
-def write_summary(folder: Path, overrides: Sequence[str], result: Evaluation) -> float:
+def write_summary(folder: Path, overrides: Sequence[str], records: Records, key: str) -> float:
     """Write the keys typed and the policy's final numbers: the last file of a run.
+
+    Args:
+        folder: of the run.
+        overrides: the keys=values that were typed.
+        records: of its evaluation; the first task is what counts.
+        key: of the policy.
 
     Returns:
         :func:`final_alignment`.
     """
-    from torchrl_pref.evaluation.reports import milestones
+    from torchrl_pref.evaluation.views import milestones
 
+    own = records.of_task(records.tasks[0])
+    curve = own.values(key, "alignment").mean((0, 1, 2))
     numbers = {
-        f"alignment after {j}": round(float(result.alignment[:, j].mean()), 4)
-        for j in milestones(result.alignment.shape[1] - 1)
+        f"alignment after {j}": round(float(curve[j]), 4) for j in milestones(len(curve) - 1)
     }
-    numbers["bits"] = round(float(result.information[:, -1].mean()), 3)
-    numbers["asked"] = round(float(result.asked.float().mean()), 2)
+    numbers["bits"] = round(float(own.values(key, "information")[..., -1].mean()), 3)
+    numbers["asked"] = round(float(own.values(key, "asked").mean()), 2)
     content = {"overrides": list(overrides), **numbers}
     write_text(folder / SUMMARY, json.dumps(content, indent=1) + "\n")
     return final_alignment(folder)

@@ -19,7 +19,7 @@ from torchrl_pref.errors import InputError
 from torchrl_pref.evaluation.comparison import (
     check_evaluation,
     compare,
-    evaluate_panels,
+    evaluate_task,
     group_checkpoints,
 )
 from torchrl_pref.evaluation.run import CURVES, draw_humans, evaluate
@@ -134,34 +134,42 @@ def test_compared_strategies_have_the_luck_that_they_have_alone(setup: str) -> N
     settings["policy"]["sample"] = True
     trainer, task = trainer_of(settings)
     checkpoint = make_checkpoint(settings, task, trainer)
-    results = compare(settings, task, task.test, {"one": checkpoint, "other": checkpoint})
+    results = compare(
+        settings, task, task.test, {"policy_feed:one": checkpoint, "policy_feed:other": checkpoint}
+    )
     n_humans, seed = check_evaluation(settings)
     env = make_query_env(settings, task, task.test, n_humans, seed)
     humans = draw_humans(env)
     for name, strategy in (
-        ("greedy", Greedy(task.response_model)),
-        ("greedy alignment", Greedy(task.response_model, alignment_gain)),
+        ("greedy_information", Greedy(task.response_model)),
+        ("greedy_alignment", Greedy(task.response_model, alignment_gain)),
     ):
         env.set_seed(seed)
         alone = evaluate(env, strategy, humans)
         for curve in CURVES:
             assert torch.equal(getattr(results[name], curve), getattr(alone, curve)), (name, curve)
     for curve in CURVES:
-        assert torch.equal(getattr(results["one"], curve), getattr(results["other"], curve))
+        assert torch.equal(
+            *(getattr(results[f"policy_feed:{name}"], curve) for name in ("one", "other"))
+        )
     assert len({float(result.alignment[:, 0].sum()) for result in results.values()}) == 1
 
 
 def test_a_policy_that_picks_indices_is_shown_on_its_own_pool_too() -> None:
     settings = settings_of("query", "paper")
     trainer, task = trainer_of(settings)
-    learned = {"RL": make_checkpoint(settings, task, trainer)}
-    held_out, own = evaluate_panels(settings, task, learned).items()
-    assert held_out[0].endswith("held-out pool")
-    assert own[0].endswith("training pool")
-    for (_, results), pool in ((held_out, task.test), (own, task.train)):
-        for name, result in compare(settings, task, pool, learned).items():
-            assert torch.equal(results[name].alignment, result.alignment)
-    assert not torch.equal(held_out[1]["RL"].alignment, own[1]["RL"].alignment)
+    learned = {"policy_query": make_checkpoint(settings, task, trainer)}
+    records = evaluate_task(settings, task, learned)
+    held_out, own = records.tasks
+    assert held_out.endswith("held-out pool")
+    assert own.endswith("training pool")
+    found = []
+    for title, pool in ((held_out, task.test), (own, task.train)):
+        for key, result in compare(settings, task, pool, learned).items():
+            values = records.of_task(title).values(key, "alignment")
+            assert torch.equal(values[0, 0], result.alignment)
+        found.append(values)
+    assert not torch.equal(*found)
 
 
 def test_runs_of_one_kind_are_told_apart_by_their_names() -> None:
@@ -171,7 +179,7 @@ def test_runs_of_one_kind_are_told_apart_by_their_names() -> None:
         trainer, task = trainer_of(settings)
         runs.append((name, make_checkpoint(settings, task, trainer), task))
     ((settings, _, learned),) = group_checkpoints(runs)
-    assert list(learned) == ["RL (a)", "RL (b)", "RL-feed"]
+    assert list(learned) == ["policy_query:a", "policy_query:b", "policy_feed"]
     assert settings["setup"]["name"] == "feed"  # the baselines of a feed are shown too
 
 
@@ -201,7 +209,7 @@ def test_bootstrap_agrees_with_scipy(generator: Generator) -> None:
         (values.numpy(),), np.mean, method="percentile", rng=np.random.default_rng(0)
     ).confidence_interval
     assert bootstrap_interval(values) == pytest.approx(tuple(expected), abs=0.03)
-    assert bootstrap_interval(torch.full((9,), 2.0)) == (2.0, 2.0)
+    assert bootstrap_interval(torch.full((9,), 2.0)) == (pytest.approx(2.0), pytest.approx(2.0))
 
 
 def test_humans_of_the_evaluation_are_not_those_of_the_training() -> None:

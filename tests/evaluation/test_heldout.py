@@ -12,11 +12,15 @@ from torchrl_pref.build import make_pools, make_task
 from torchrl_pref.checkpoints.checkpoint import Checkpoint
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.errors import InputError
-from torchrl_pref.evaluation import heldout
-from torchrl_pref.evaluation.heldout import Cell, Job, Outcome, run_protocol, run_side_by_side
-from torchrl_pref.evaluation.heldout_report import paired, reaches, write_heldout
+from torchrl_pref.evaluation import heldout, heldout_pool
+from torchrl_pref.evaluation.heldout import kinds_of, run_protocol
+from torchrl_pref.evaluation.heldout_pool import Cell, Job, fit_threshold, run_pool, task_and_pool
+from torchrl_pref.evaluation.records import Entry, Records
+from torchrl_pref.evaluation.reports import write_report
 from torchrl_pref.evaluation.run import draw_humans
-from torchrl_pref.evaluation.statistics import two_way_interval
+from torchrl_pref.evaluation.side_by_side import Entrant, run_side_by_side
+from torchrl_pref.evaluation.statistics import bootstrap_interval
+from torchrl_pref.evaluation.views import answers_to_reach, difference
 from torchrl_pref.pool import Normalizer, balance
 from torchrl_pref.strategies import RandomAsk
 from torchrl_pref.tasks.gridworld import GridworldTask, gridworld_pool
@@ -28,9 +32,16 @@ def checkpoint_of(settings: dict[str, Any]) -> Checkpoint:
     return make_checkpoint(settings, task, trainer)
 
 
-def outcome(alignment: torch.Tensor) -> Outcome:
-    table = alignment[..., 0, 0]
-    return Outcome(alignment, table, table, table)
+def records_of(**alignment: torch.Tensor) -> Records:
+    """From (P S B H+1) of each strategy."""
+    return Records(
+        [
+            Entry("heldout", "query/noisy/corners", str(p), s, key, {"alignment": values})
+            for key, table in alignment.items()
+            for p, row in enumerate(table)
+            for s, values in enumerate(row)
+        ]
+    )
 
 
 def test_interval_covers_pools_and_seeds(generator: Generator) -> None:
@@ -39,32 +50,37 @@ def test_interval_covers_pools_and_seeds(generator: Generator) -> None:
     seeds = 0.5 * torch.randn(400, 1, 5, generator=generator)
     covered = widths = 0.0
     for table in pools + seeds:
-        low, high = two_way_interval(table, 500)
+        low, high = bootstrap_interval(table)
         covered += low <= 0 <= high
         widths += (high - low) / 400
     # Percentile intervals of so few clusters are somewhat too narrow.
     assert 0.85 < covered / 400 < 0.97
     assert widths == pytest.approx(2 * 1.96 * (1 / 10 + 0.25 / 5) ** 0.5, rel=0.15)
-    assert two_way_interval(torch.full((3, 2), 0.7)) == (pytest.approx(0.7), pytest.approx(0.7))
+    assert bootstrap_interval(torch.full((3, 2), 0.7)) == (pytest.approx(0.7), pytest.approx(0.7))
 
 
 def test_interval_is_widened_by_what_few_pools_hide() -> None:
     """Two pools at 0 and 1: a bootstrap's mean is 0, 1/2 or 1, and its interval all of it. Of the
     variance between two pools it shows half."""
-    low, high = two_way_interval(torch.tensor([[0.0], [1.0]]))
+    low, high = bootstrap_interval(torch.tensor([[0.0], [1.0]]))
     assert low == pytest.approx(0.5 - 0.5 * 2**0.5)
     assert high == pytest.approx(0.5 + 0.5 * 2**0.5)
 
 
 def test_differences_are_paired_and_levels_are_reached() -> None:
     rising = torch.linspace(0, 1, 11).expand(2, 3, 4, 11)
-    one, other = outcome(rising), outcome(rising[:, :1] - 0.25)
-    assert torch.allclose(paired(one, other), torch.tensor(0.25))
-    assert torch.allclose(paired(one, outcome(rising[:, :1, :2])), torch.tensor(0.0))
-    two_runs = outcome(torch.cat([rising[:, :1] - 0.25, rising[:, :1] - 0.75], 1))
-    assert torch.allclose(paired(one, two_runs), torch.tensor(0.5))
-    assert reaches(one, 0.55) == "6"
-    assert reaches(other, 0.9) == "never"
+    two_runs = torch.cat([rising[:, :1] - 0.25, rising[:, :1] - 0.75], 1)
+    found = records_of(
+        policy_query=rising,
+        random=rising[:, :1] - 0.25,
+        greedy_many_samples=rising[:, :1, :2],
+        greedy_alignment=two_runs,
+    )
+    assert found.values("greedy_alignment", "alignment").shape == (2, 2, 4, 11)
+    for key, gap in (("random", 0.25), ("greedy_many_samples", 0.0), ("greedy_alignment", 0.5)):
+        assert torch.allclose(difference(found, "policy_query", key), torch.tensor(gap))
+    assert answers_to_reach(found, "policy_query", 0.55) == "6"
+    assert answers_to_reach(found, "random", 0.9) == "never"
 
 
 def test_balanced_options_differ_equally_in_every_direction() -> None:
@@ -81,42 +97,47 @@ def test_balanced_options_differ_equally_in_every_direction() -> None:
 def test_protocol_pairs_all_strategies_on_pools_of_its_own(
     setup: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(heldout, "HUMANS", 6)
-    monkeypatch.setattr(heldout, "FINE_HUMANS", 2)
-    monkeypatch.setattr(heldout, "FINE_SAMPLES", 40)
+    monkeypatch.setattr(heldout_pool, "HUMANS", 6)
+    monkeypatch.setattr(heldout_pool, "FINE_HUMANS", 2)
+    monkeypatch.setattr(heldout_pool, "FINE_SAMPLES", 40)
     settings = settings_of(setup)
     cell = Cell(setup, "noisy")
-    learned = [checkpoint_of({**settings, "seed": seed}) for seed in (0, 1)]
-    rows = [heldout._run_pool(Job(settings, cell, pool, learned, (0.2,))) for pool in (0, 1)]
-    rival, once = (
-        ("greedy alignment", "random") if setup == "query" else ("quantile of alignment", "ask all")
+    policy = f"policy_{setup}"
+    learned = kinds_of([checkpoint_of({**settings, "seed": seed}) for seed in (0, 7)])
+    assert list(learned) == [policy]
+    jobs = [Job(settings, cell, pool, learned, (0.2,)) for pool in (0, 1)]
+    records = Records([entry for job in jobs for entry in run_pool(job)])
+    strong, once = (
+        ("greedy_alignment", "random") if setup == "query" else ("quantile_alignment", "ask_all")
     )
-    for row in rows:
-        assert list(row)[-1] == "RL"
-        assert [len(row[name]) for name in (rival, once, "RL")] == [heldout.RUNS, 1, 2]
-        if setup == "feed":  # one name alone takes every offer
-            assert (row[once][0].offered == row[once][0].asked).all()
-            assert (row[rival][0].offered > row[rival][0].asked).any()
-        if setup == "query":
-            assert (row["greedy information, no repeats"][0].repeated == 0).all()
-            (fine,) = row["greedy information, M=40 (2 humans a pool)"]
-            assert fine.ess[:, 0].tolist() == [40.0, 40.0]
-        # All start from the same prior samples of the same humans.
-        start = row["RL"][0].alignment[:, 0]
-        for name, results in row.items():
-            if "M=40" not in name:
-                assert torch.equal(results[0].alignment[:, 0], start)
+    assert records.strategies[-1] == policy
+    assert {entry.seed for entry in records.entries if entry.strategy == policy} == {0, 7}
+    counts = [records.values(key, "alignment").shape[1] for key in (strong, once, policy)]
+    assert counts == [heldout_pool.RUNS, 1, 2]
+    if setup == "feed":  # one alone takes every offer
+        asked, offered = (records.values(once, name) for name in ("asked", "offered"))
+        assert torch.equal(asked, offered)
+        assert (records.values(strong, "offered") > records.values(strong, "asked")).any()
+    if setup == "query":
+        assert (records.values("greedy_no_repeats", "repeated") == 0).all()
+        assert records.values("greedy_many_samples:M=40", "alignment").shape == (2, 1, 2, 5)
+    # All start from the same prior samples of the same humans.
+    start = records.values(policy, "alignment")[:, 0, :, 0]
+    for key in records.strategies:
+        if not key.startswith("greedy_many_samples"):
+            assert torch.equal(records.values(key, "alignment")[:, 0, :, 0], start)
     # Another pool, other humans.
-    first, second = (row["RL"][0].alignment[:, 0] for row in rows)
-    assert not torch.isclose(first, second).any()
+    assert not torch.isclose(*start).any()
     trained = make_pools(settings)
     for pool in (0, 1):
-        _, own = heldout._task_and_pool(Job(settings, cell, pool))
+        _, own = task_and_pool(Job(settings, cell, pool))
         task = make_task(*trained, "noisy")
         assert own.digest not in (task.train.digest, task.test.digest)
-    write_heldout(tmp_path, {cell: heldout._gather(rows)})
+    write_report(tmp_path, records)
     assert (tmp_path / "heldout.png").stat().st_size > 10_000
-    assert "RL minus it" in (tmp_path / "heldout.txt").read_text()
+    text = (tmp_path / "tables.txt").read_text()
+    assert f"{setup}, noisy human: alignment, 2 pools of 6 humans, 2 training seeds" in text
+    assert "differences on the same humans" in text
 
 
 def test_no_two_pools_share_a_seed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -131,7 +152,7 @@ def test_no_two_pools_share_a_seed(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(GridworldTask, "trajectories", watched)
     for pool in range(heldout.POOLS):
-        heldout._task_and_pool(Job(settings_of("feed"), Cell("feed", "noisy"), pool))
+        task_and_pool(Job(settings_of("feed"), Cell("feed", "noisy"), pool))
     per_call = 2 * 3  # training, test, and the pool itself
     assert len(seeds) == per_call * heldout.POOLS
     assert len(set(seeds)) == 4 + 2 * heldout.POOLS
@@ -141,7 +162,7 @@ def test_the_threshold_is_fitted_without_a_look_at_the_test_pools() -> None:
     fits = []
     for pool in (0, 1):
         job = Job(settings_of("feed"), Cell("feed", "noisy"), pool, thresholds=(0.1, 0.4))
-        fits.append(heldout._fit_threshold(job))
+        fits.append(fit_threshold(job))
     assert torch.equal(*fits)
     assert fits[0][0] != fits[0][1]
 
@@ -160,15 +181,13 @@ def test_policies_of_other_tasks_are_refused() -> None:
 def test_normaliser_is_that_of_the_training_pool() -> None:
     settings = settings_of("query")
     train, _ = make_pools(settings)
-    task, own = heldout._task_and_pool(Job(settings, Cell("query", "noisy"), 3))
+    task, own = task_and_pool(Job(settings, Cell("query", "noisy"), 3))
     assert torch.equal(task.normalizer.mean, Normalizer.fit(train.features).mean)
     assert own.features.mean().abs() > 1e-6
 
 
 def test_features_are_balanced_by_the_training_pool() -> None:
-    task, own = heldout._task_and_pool(
-        Job(settings_of("query"), Cell("query", "noisy", "balanced"), 0)
-    )
+    task, own = task_and_pool(Job(settings_of("query"), Cell("query", "noisy", "balanced"), 0))
     largest = []
     for pool in (task.train, own):
         gaps = pool.features[:, 0] - pool.features[:, 1]
@@ -181,20 +200,20 @@ def test_features_are_balanced_by_the_training_pool() -> None:
 def test_strategies_side_by_side_meet_the_same_offers_and_humans() -> None:
     """A strategy beside others does what it does alone where nothing is drawn anew."""
     settings = settings_of("feed")
-    task, pool = heldout._task_and_pool(Job(settings, Cell("feed", "noisy"), 0))
+    task, pool = task_and_pool(Job(settings, Cell("feed", "noisy"), 0))
 
     def make_env(sessions: int) -> FeedEnv:
-        return heldout.make_feed_env(settings, task, pool, sessions, 5)
+        return heldout_pool.make_feed_env(settings, task, pool, sessions, 5)
 
     humans = draw_humans(make_env(7))
-    twice = [("rule", RandomAsk()), ("rule", RandomAsk())]
+    twice = [Entrant("rule", RandomAsk()), Entrant("rule", RandomAsk())]
     one, two = run_side_by_side(make_env, humans, twice)["rule"]
     # The first question is asked of the same belief, so it is worth the same.
     assert torch.allclose(one.information[:, 1], two.information[:, 1], atol=1e-6)
     assert torch.equal(one.alignment[:, 0], two.alignment[:, 0])
     other = draw_humans(make_env(7))
     other["offers"] = humans["offers"].flip(1)
-    (third,) = run_side_by_side(make_env, other, [("rule", RandomAsk())])["rule"]
+    (third,) = run_side_by_side(make_env, other, [Entrant("rule", RandomAsk())])["rule"]
     assert not torch.allclose(one.information[:, 1], third.information[:, 1], atol=1e-3)
 
 
@@ -206,27 +225,29 @@ def test_whole_protocol(monkeypatch: pytest.MonkeyPatch) -> None:
     learned = {}
     for setup in ("query", "feed"):
         learned[Cell(setup, "noisy")] = [checkpoint_of({**settings_of(setup), "seed": 3})]
-    results = run_protocol(settings_of("feed"), learned, 1)
-    assert set(results) == {
-        Cell("query", "noisy"),
-        Cell("query", "noisy", "balanced"),
-        Cell("feed", "noisy"),
-    }
+    records = run_protocol(settings_of("feed"), learned, 1)
+    assert records.tasks == ["query/noisy/corners", "query/noisy/balanced", "feed/noisy/corners"]
     fit = Job(settings_of("feed"), Cell("feed", "noisy"), 0, thresholds=(0.1, 9.0))
-    best = (0.1, 9.0)[int(heldout._fit_threshold(fit).argmax())]
-    assert f"threshold {best:g} bits" in results[Cell("feed", "noisy")]
-    assert results[Cell("query", "noisy")]["RL"].alignment.shape == (1, 1, heldout.HUMANS, 5)
-    assert "two-step lookahead" in results[Cell("query", "noisy")]
-    rival = results[Cell("query", "noisy")]["greedy alignment"].alignment
-    assert rival.shape == (1, heldout.RUNS, heldout.HUMANS, 5)
-    assert not torch.equal(rival[0, 0], rival[0, 1])  # another luck of the belief
+    best = (0.1, 9.0)[int(fit_threshold(fit).argmax())]
+    query, _, feed = map(records.of_task, records.tasks)
+    assert f"threshold:{best:g}" in feed.strategies
+    humans = heldout_pool.HUMANS
+    assert query.values("policy_query", "alignment").shape == (1, 1, humans, 5)
+    assert "lookahead" in query.strategies
+    strong = query.values("greedy_alignment", "alignment")
+    assert strong.shape == (1, heldout_pool.RUNS, humans, 5)
+    assert not torch.equal(strong[0, 0], strong[0, 1])  # another luck of the belief
 
 
-def test_only_training_seeds_are_averaged() -> None:
+def test_policies_that_differ_in_their_seed_alone_are_one_kind() -> None:
     settings = settings_of("query")
-    cell = Cell("query", "noisy")
-    one, other = (
-        checkpoint_of({**settings, "objective": name}) for name in ("alignment", "entropy")
-    )
-    with pytest.raises(InputError, match="differ in objective"):
-        run_protocol(settings, {cell: [one, other]}, 1)
+    twice = [checkpoint_of({**settings, "seed": seed}) for seed in (0, 1)]
+    other = checkpoint_of({**settings, "objective": "entropy"})
+    attention = checkpoint_of(settings_of("query", "attention"))
+    kinds = kinds_of([twice[0], attention, other, twice[1]])
+    assert {key: len(members) for key, members in kinds.items()} == {
+        "policy_query:scorer, objective=alignment": 2,
+        "policy_query:attention": 1,
+        "policy_query:scorer, objective=entropy": 1,
+    }
+    assert list(kinds_of(twice)) == ["policy_query"]

@@ -121,6 +121,19 @@ def check_loggers(name: str, value: Any) -> None:
             )
 
 
+def check_strategy(name: str, value: Any) -> None:
+    """Refuse what is no name of a strategy of the user.
+
+    Raises:
+        InputError: it is not ``module:name``.
+    """
+    if not isinstance(value, str) or not re.fullmatch(r"[^\W\d][\w.]*:[^\W\d]\w*", value):
+        raise InputError(
+            f"{name}={value!r}: expected <module>:<name>, as in {name}=mine:Rule for what Rule of "
+            "mine.py makes of the environment"
+        )
+
+
 def optional(check: Check) -> Check:
     """The check, or null."""
     return lambda name, value: None if value is None else check(name, value)

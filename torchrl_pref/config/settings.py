@@ -20,6 +20,7 @@ from torchrl_pref.config.checks import (
     check_loggers,
     check_path,
     check_spread,
+    check_strategy,
     check_tau,
     choice,
     count,
@@ -88,6 +89,7 @@ EVALUATE: dict[str, Check] = {
     "protocol": optional(choice("heldout")),
     "workers": count(1, LARGEST_THREADS),
     "checkpoint": optional(one_or_more(check_path)),
+    "strategy": optional(one_or_more(check_strategy)),
 }
 """Of evaluate.py."""
 
@@ -189,6 +191,11 @@ def check_evaluate_settings(settings: Settings) -> None:
     _check_together(settings)
     if "policy" in settings:
         one_or_more(choice("noisy", "optimal"))("tau", settings["tau"])
+        if settings["setup"]["name"] == "feed" and settings["skip"] != "free":
+            raise InputError(
+                f"policy=pretrained with skip={settings['skip']}: the pretrained feed policies "
+                "were trained with free skips and a budget of asks; expected skip=free; remove skip"
+            )
     check_memory(settings)
 
 

@@ -1,12 +1,12 @@
-"""Learned policies beside random and greedy: the rows of the tables, the panels of Figure 1."""
+"""Learned policies beside random and greedy on the same humans: a task for each kind of human."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
-from tensordict.nn import TensorDictModuleBase
 from tqdm import tqdm
 
 from torchrl_pref.acquisition.functions import alignment_gain
@@ -16,7 +16,10 @@ from torchrl_pref.config.memory import check_memory
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.errors import InputError, check_count, check_flag, check_seed
-from torchrl_pref.evaluation.run import Evaluation, draw_humans, evaluate
+from torchrl_pref.evaluation.own import Maker, make_own, try_own
+from torchrl_pref.evaluation.records import Records, entry_of
+from torchrl_pref.evaluation.run import CURVES, Evaluation, draw_humans, evaluate
+from torchrl_pref.evaluation.side_by_side import Entrant
 from torchrl_pref.policies.base import Policy
 from torchrl_pref.pool import QueryPool
 from torchrl_pref.strategies import Greedy, QuantileAsk, RandomAsk, RandomQuery
@@ -24,40 +27,50 @@ from torchrl_pref.strategies import Greedy, QuantileAsk, RandomAsk, RandomQuery
 FIRST_EVALUATION_SEED = 2**31
 """Evaluation seeds lie where no training seed does: the humans of the one are not the other's."""
 
-Panels = dict[str, dict[str, Evaluation]]
+HELD_OUT, TRAINING = "held-out", "training"
+"""The pools, as records name them."""
 
 
-def label_of(settings: Settings) -> str:
-    """The name of a learned policy in tables and figures: the paper's ``RL`` and ``RL-feed``."""
-    return "RL-feed" if settings["setup"]["name"] == "feed" else "RL"
+def policy_key(settings: Settings) -> str:
+    """The kind of a learned policy, by its setup: the paper's ``RL`` or ``RL-feed``."""
+    return "policy_feed" if settings["setup"]["name"] == "feed" else "policy_query"
 
 
-def evaluate_panels(
-    settings: Settings, task: Task, learned: Mapping[str, Checkpoint], test: QueryPool | None = None
-) -> Panels:
+def evaluate_task(
+    settings: Settings,
+    task: Task,
+    learned: Mapping[str, Checkpoint],
+    test: QueryPool | None = None,
+    own: Mapping[str, Maker] | None = None,
+) -> Records:
     """Compare strategies on the held-out pool.
 
     The paper's query policy picks an index of its training pool, which means nothing on another
-    pool. It is evaluated on the held-out pool all the same, and on its own pool in a second panel.
+    pool. It is evaluated on the held-out pool all the same, and as a task of its own on the pool
+    that it knows.
 
     Args:
         settings: of the evaluation, or of the training that it ends.
         task: the pools and the response model.
-        learned: checkpoints to evaluate, by the name to show.
+        learned: checkpoints to evaluate, by key.
         test: another held-out pool, normalised; by default the task's.
-
-    Returns:
-        By title: by name of the strategy, what it did.
+        own: what makes the strategies of the user.
     """
-    held_out = task.test if test is None else test
+    pools = {HELD_OUT: task.test if test is None else test}
     evaluated = {key: value for key, value in settings.items() if key != "training"}
-    check_memory(evaluated, *held_out.features.shape)
-    if not any(checkpoint.picks_by_index for checkpoint in learned.values()):
-        return {task.title: compare(settings, task, held_out, learned)}
-    return {
-        f"{task.title}, held-out pool": compare(settings, task, held_out, learned),
-        f"{task.title}, training pool": compare(settings, task, task.train, learned),
-    }
+    check_memory(evaluated, *pools[HELD_OUT].features.shape)
+    if any(checkpoint.picks_by_index for checkpoint in learned.values()):
+        pools[TRAINING] = task.train
+    records = Records()
+    for name, pool in pools.items():
+        title = task.title if len(pools) == 1 else f"{task.title}, {name} pool"
+        for key, result in compare(settings, task, pool, learned, own).items():
+            seed = learned[key].settings["seed"] if key in learned else 0
+            identity = {"protocol": "comparison", "task": title, "pool": name}
+            records.entries.append(
+                entry_of(result, CURVES, "seconds_per_query", **identity, seed=seed, strategy=key)
+            )
+    return records
 
 
 def check_evaluation(settings: Settings) -> tuple[int, int]:
@@ -74,7 +87,11 @@ def check_evaluation(settings: Settings) -> tuple[int, int]:
 
 
 def compare(
-    settings: Settings, task: Task, pool: QueryPool, learned: Mapping[str, Checkpoint]
+    settings: Settings,
+    task: Task,
+    pool: QueryPool,
+    learned: Mapping[str, Checkpoint],
+    own: Mapping[str, Maker] | None = None,
 ) -> dict[str, Evaluation]:
     """Baselines and learned policies on the same humans and luck.
 
@@ -84,35 +101,40 @@ def compare(
         settings: the sections ``setup``, ``belief``, ``evaluation`` and ``device``.
         task: gives the response model.
         pool: the queries, normalised.
-        learned: checkpoints to evaluate, by the name to show.
+        learned: checkpoints to evaluate, by key.
+        own: what makes the strategies of the user; they are made for the setup of the settings.
 
     Returns:
-        By name: ``random``, ``greedy`` (information gain), ``greedy alignment``, for a feed also
-        ``ask all`` and ``quantile`` (of alignment), and the learned ones.
+        By key: ``random``, ``greedy_information``, ``greedy_alignment``, for a feed also
+        ``ask_all`` and ``quantile_alignment``, the learned ones and those of the user.
     """
     n_humans, seed = check_evaluation(settings)
     humans = draw_humans(make_query_env(settings, task, pool, n_humans, seed))
-    runs: list[tuple[str, QueryEnv | FeedEnv, TensorDictModuleBase, bool]] = []
+    runs: list[tuple[QueryEnv | FeedEnv, Entrant]] = []
 
     query_env = make_query_env(settings, task, pool, n_humans, seed)
-    runs.append(("random", query_env, RandomQuery(seed + 1), False))
-    runs.append(("greedy", query_env, Greedy(task.response_model), False))
+    runs.append((query_env, Entrant("random", RandomQuery(seed + 1))))
+    runs.append((query_env, Entrant("greedy_information", Greedy(task.response_model))))
     by_alignment = Greedy(task.response_model, alignment_gain)
-    runs.append(("greedy alignment", query_env, by_alignment, False))
+    runs.append((query_env, Entrant("greedy_alignment", by_alignment)))
     if settings["setup"]["name"] == "feed":
         feed_env = make_feed_env(settings, task, pool, n_humans, seed)
-        runs.append(("ask all", feed_env, RandomAsk(), False))
-        runs.append(("quantile", feed_env, QuantileAsk(feed_env, alignment_gain), False))
-    for name, checkpoint in learned.items():
+        runs.append((feed_env, Entrant("ask_all", RandomAsk())))
+        quantile = QuantileAsk(feed_env, alignment_gain)
+        runs.append((feed_env, Entrant("quantile_alignment", quantile)))
+    for key, checkpoint in learned.items():
         env, policy = _load_policy(checkpoint, task, pool, n_humans, seed)
         sample = check_flag("policy.sample", checkpoint.settings["policy"]["sample"])
-        runs.append((name, env, policy.strategy, sample))
+        runs.append((env, Entrant(key, policy.strategy, sample)))
+    if own:
+        env = _make_env(settings, task, pool, n_humans, seed)
+        runs += [(env, entrant) for entrant in make_own(own, env, seed)]
 
     results = {}
-    for name, env, strategy, sample in tqdm(runs, desc="evaluation", unit="strategy"):
+    for env, entrant in tqdm(runs, desc="evaluation", unit="strategy"):
         env.set_seed(seed)
         torch.manual_seed(seed)
-        results[name] = evaluate(env, strategy, humans, sample)
+        results[entrant.key] = evaluate(env, entrant.strategy, humans, entrant.sample)
     return results
 
 
@@ -122,9 +144,26 @@ def _load_policy(
     """A trained policy and the environment of its own setup on a pool."""
     checkpoint.check_fits(pool)
     settings = checkpoint.settings
-    make = make_feed_env if settings["setup"]["name"] == "feed" else make_query_env
-    env = make(settings, task, pool, n_humans, seed)
+    env = _make_env(settings, task, pool, n_humans, seed)
     return env, load_policy(checkpoint, env)
+
+
+def _make_env(
+    settings: Settings, task: Task, pool: QueryPool, n_humans: int, seed: int
+) -> QueryEnv | FeedEnv:
+    """The environment of the settings' setup, with all of a pool on the table."""
+    make = make_feed_env if settings["setup"]["name"] == "feed" else make_query_env
+    return make(settings, task, pool, n_humans, seed)
+
+
+def try_strategies(own: Mapping[str, Maker], settings: Settings, task: Task) -> None:
+    """Refuse strategies of the user that cannot decide in a task, before anything is run.
+
+    Raises:
+        InputError: one cannot be made, fails, or writes no action.
+    """
+    if own:
+        try_own(own, _make_env(settings, task, task.test, 2, 0))
 
 
 def _feed_of(checkpoint: Checkpoint) -> tuple[Any, Any] | None:
@@ -142,22 +181,23 @@ def _skip_of(checkpoint: Checkpoint) -> str | None:
 def group_checkpoints(
     runs: Sequence[tuple[str, Checkpoint, Task]],
 ) -> list[tuple[Settings, Task, dict[str, Checkpoint]]]:
-    """Put runs that faced the same kind of human on the same pools into one panel.
+    """Put runs that faced the same kind of human on the same pools together.
 
     Args:
         runs: name, checkpoint and task of each run.
 
     Returns:
-        For each panel its settings, its task and its checkpoints by the name to show.
+        For each kind of human the settings, the task and the checkpoints by key.
 
     Raises:
-        InputError: runs of one panel were trained with other pools, budgets or beliefs, so that
-            they cannot be compared on the same humans.
+        InputError: runs with one kind of human were trained with other pools, budgets or beliefs,
+            so that they cannot be compared on the same humans.
     """
     groups: dict[str, list[tuple[str, Checkpoint, Task]]] = {}
     for run in runs:
-        groups.setdefault(run[2].title, []).append(run)
-    panels = []
+        # As far as tau is the same on every machine that solves for it.
+        groups.setdefault(f"{run[2].tau or math.inf:.4g}", []).append(run)
+    tasks = []
     for members in groups.values():
         _, first, task = members[0]
         learned = {}
@@ -178,13 +218,13 @@ def group_checkpoints(
                         f"{name} and {members[0][0]} differ in {what}: {mine} and {theirs}; "
                         "evaluate them one at a time"
                     )
-            label = label_of(checkpoint.settings)
-            same = sum(label_of(other.settings) == label for _, other, _ in members)
-            learned[label if same == 1 else f"{label} ({name})"] = checkpoint
+            kind = policy_key(checkpoint.settings)
+            same = sum(policy_key(other.settings) == kind for _, other, _ in members)
+            learned[kind if same == 1 else f"{kind}:{name}"] = checkpoint
         # Baselines choose as the query runs may; a feed among them adds its offers.
         settings = dict(first.settings)
         feed_last = sorted(all_of, key=lambda c: bool(c.settings["setup"]["name"] == "feed"))
         settings["setup"] = {k: v for c in feed_last for k, v in c.settings["setup"].items()}
         settings["skip"] = feed_last[-1].settings["skip"]
-        panels.append((settings, task, learned))
-    return panels
+        tasks.append((settings, task, learned))
+    return tasks

@@ -8,35 +8,34 @@ from functools import lru_cache
 import torch
 from torch import Generator, Tensor
 
-
-def bootstrap_interval(values: Tensor, seed: int = 0, resamples: int = 2000) -> tuple[float, float]:
-    """Percentile bootstrap 95% interval of the mean of values (B) over humans."""
-    means = _resampled_shares(len(values), seed, resamples) @ values.float()
-    low, high = torch.quantile(means, torch.tensor([0.025, 0.975])).tolist()
-    return low, high
+RESAMPLES = 4000
 
 
-@lru_cache(maxsize=1)
-def _resampled_shares(count: int, seed: int, resamples: int) -> Tensor:
-    """The share of each human (resamples B) in each resample; the same for every curve."""
-    generator = Generator().manual_seed(seed)
-    picks = torch.randint(count, (resamples, count), generator=generator)
-    ones = torch.ones(1).expand(picks.shape)
-    return torch.zeros(picks.shape).scatter_add_(1, picks, ones) / count
+def bootstrap_interval(values: Tensor, seed: int = 0) -> tuple[float, float]:
+    """Bootstrap interval of the mean of values over one factor (P), or over two crossed ones (P S).
 
-
-def two_way_interval(values: Tensor, resamples: int = 4000) -> tuple[float, float]:
-    """Bootstrap interval of the mean of values (P S) over pools and seeds, drawn apart.
-
+    One factor is humans that one strategy met; two are pools and training seeds, drawn apart.
     Nominally 95%. Resampling P things shows (P - 1)/P of their variance, which is made up for; even
-    so the interval covers somewhat less, and much less where P is 3.
+    so the interval covers somewhat less where there are few, and much less where P is 3.
     """
-    generator = Generator().manual_seed(0)
-    n_pools, n_seeds = values.shape
-    pools = torch.randint(n_pools, (resamples, n_pools), generator=generator)
-    seeds = torch.randint(n_seeds, (resamples, n_seeds), generator=generator)
-    means = values[pools.unsqueeze(-1), seeds.unsqueeze(-2)].mean((1, 2))
-    centre, widen = values.mean(), math.sqrt(n_pools / max(1, n_pools - 1))
+    drawn = _resampled_shares(tuple(values.shape), seed)
+    means = drawn[0] @ values.float()
+    if values.ndim == 2:
+        means = (means * drawn[1]).sum(1)
+    centre, widen = values.float().mean(), math.sqrt(len(values) / max(1, len(values) - 1))
     bounds = torch.quantile(means, torch.tensor([0.025, 0.975]))
     low, high = (centre + widen * (bounds - centre)).tolist()
     return low, high
+
+
+@lru_cache(maxsize=4)
+def _resampled_shares(counts: tuple[int, ...], seed: int) -> list[Tensor]:
+    """The share of each thing of each factor (resamples P) in each resample; the same for every
+    curve."""
+    generator = Generator().manual_seed(seed)
+    shares = []
+    for count in counts:
+        picks = torch.randint(count, (RESAMPLES, count), generator=generator)
+        ones = torch.ones(1).expand(picks.shape)
+        shares.append(torch.zeros(picks.shape).scatter_add_(1, picks, ones) / count)
+    return shares

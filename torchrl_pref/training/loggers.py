@@ -1,8 +1,8 @@
 """Where the numbers of a training go while it runs: its table, and TorchRL's loggers.
 
 ``csv`` is ``training.csv``, a row for each update (:mod:`torchrl_pref.training.progress`): the
-logger of that name in TorchRL writes a file for each metric, and is not used. The others are TorchRL's.
-Each process that trains is a run of its own for ``wandb`` and ``mlflow``: a resumed training is a
+logger of that name in TorchRL writes a file for each metric, and is not used. The others are
+TorchRL's. Each process that trains is a run of its own for ``wandb`` and ``mlflow``: a resumed training is a
 second one, of the same name, that goes on at the update where it was resumed.
 """
 

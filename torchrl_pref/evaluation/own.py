@@ -1,0 +1,101 @@
+"""Strategies of the user, named as ``module:name``, to be judged beside ours.
+
+``name`` is called with the environment, a :class:`QueryEnv` or a :class:`FeedEnv`, and gives a
+TensorDictModule that writes ``action``: for each session the number of a candidate, or 0 to skip
+and 1 to ask. Where it is a probabilistic actor its most likely action is taken.
+
+Only what the user typed is imported: names come from the command line and never from a file.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torchrl_pref.envs.feed import FeedEnv
+from torchrl_pref.envs.query import QueryEnv
+from torchrl_pref.errors import InputError
+from torchrl_pref.evaluation.side_by_side import Entrant
+from torchrl_pref.groups import load
+
+Maker = Callable[[QueryEnv | FeedEnv], TensorDictModuleBase]
+
+
+def find_makers(typed: Sequence[str]) -> dict[str, Maker]:
+    """Import what makes each strategy; the current directory is looked in last.
+
+    Args:
+        typed: ``module:name`` of each.
+
+    Returns:
+        What was imported, by the same names.
+
+    Raises:
+        InputError: there is no such module or name, or it cannot be called.
+    """
+    return {name: load(f"strategy={name}", name) for name in typed}
+
+
+def make_own(makers: Mapping[str, Maker], env: QueryEnv | FeedEnv, seed: int) -> list[Entrant]:
+    """The strategies, each made for an environment, with a generator seeded alike.
+
+    Raises:
+        InputError: making one fails, or makes something else.
+    """
+    entrants = []
+    for typed, maker in makers.items():
+        torch.manual_seed(seed)
+        try:
+            strategy = maker(env)
+        except Exception as error:
+            raise InputError(
+                f"strategy={typed}: making it for a {type(env).__name__} fails ({_told(error)}); "
+                "expected a function of the environment, or a class made with it"
+            ) from error
+        if not isinstance(strategy, TensorDictModuleBase):
+            raise InputError(
+                f"strategy={typed}: made something of type {type(strategy).__name__}; expected a "
+                "TensorDictModule that writes action"
+            )
+        entrants.append(Entrant(f"own:{typed}", strategy))
+    return entrants
+
+
+def try_own(makers: Mapping[str, Maker], env: QueryEnv | FeedEnv) -> None:
+    """Let each strategy decide once, so that one which cannot is refused before anything is run.
+
+    Args:
+        makers: as found.
+        env: a small one of its own, which is used up.
+
+    Raises:
+        InputError: a strategy cannot be made, fails, or writes no action of this environment.
+    """
+    for typed, entrant in zip(makers, make_own(makers, env, 0), strict=True):
+        try:
+            with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+                decided = entrant.strategy(env.reset())
+                if not isinstance(decided, TensorDictBase) or decided.get("action", None) is None:
+                    raise InputError("it writes no action")
+                env.step(decided)
+        except Exception as error:
+            raise InputError(
+                f"strategy={typed}: its first decision in a {type(env).__name__} fails "
+                f"({_told(error)}); expected a TensorDictModule that writes action, one whole "
+                "number for each session"
+            ) from error
+
+
+def _told(error: BaseException) -> str:
+    """An error and where it was raised, in one line."""
+    if isinstance(error, InputError):
+        return str(error)
+    text = " ".join(f"{type(error).__name__}: {error}".split())[:300]
+    frames = traceback.extract_tb(error.__traceback__)
+    return f"{text}, {Path(frames[-1].filename).name} line {frames[-1].lineno}" if frames else text

@@ -1,0 +1,199 @@
+"""Tables of an evaluation, as text.
+
+Shapes: P pools, S training seeds (of a baseline: runs), B humans of a pool, H query budget.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from tabulate import tabulate
+from torch import Tensor
+
+from torchrl_pref.evaluation.records import Records
+from torchrl_pref.evaluation.style import baseline_of, is_feed, is_judged, kind_of, name_of
+from torchrl_pref.evaluation.views import (
+    alignment,
+    answers_to_reach,
+    comparisons,
+    difference,
+    mean_and_interval,
+    milestones,
+)
+
+
+def signed(mean: float, interval: tuple[float, float]) -> str:
+    """A difference and its interval, as tables show them."""
+    return "{:+.3f} [{:+.3f}, {:+.3f}]".format(mean, *interval)
+
+
+def tables(records: Records) -> str:
+    """All tables of an evaluation, and what is to be said of them."""
+    parts = []
+    for task in records.tasks:
+        own = records.of_task(task)
+        parts += [f"{title_of(task)}: alignment, {counts(own)}", "", alignment_table(own), ""]
+        parts += feed_note(own)
+        if any(map(is_judged, own.strategies)):
+            parts += ["differences on the same humans [95%]", "", difference_table(own), ""]
+        parts += ["after the last query", "", detail_table(own), ""]
+        parts += [*few_samples(own), *many_repeats(own)]
+    return "\n".join(parts)
+
+
+def title_of(task: str) -> str:
+    """Of a task, for readers."""
+    setup, _, rest = task.partition("/")
+    if not rest:
+        return task
+    tau, features = rest.split("/")
+    human = f"{tau} human" if tau in ("noisy", "optimal") else f"tau={tau} human"
+    added = {"balanced": ", balanced features", "own": ", own pool"}.get(features, "")
+    return f"{setup}, {human}{added}"
+
+
+def counts(records: Records) -> str:
+    """How many humans there were, and of which and of how many things the intervals are."""
+    shapes = {key: alignment(records, key).shape for key in records.strategies}
+    n_pools, _, n_humans, _ = next(iter(shapes.values()))
+    if all(shape[:2] == (1, 1) for shape in shapes.values()):
+        return f"{n_humans} humans"
+    seeds = max((shape[1] for key, shape in shapes.items() if is_judged(key)), default=1)
+    own = records.entries[0].task.endswith("/own")
+    pools = (
+        f"{n_pools} groups of {n_humans} humans" if own else f"{n_pools} pools of {n_humans} humans"
+    )
+    return (
+        f"{pools}, {seeds} training seeds, intervals over {'groups' if own else 'pools'} and seeds"
+    )
+
+
+def alignment_table(records: Records, style: str = "simple") -> str:
+    """The headline table: alignment, and the paired difference to what each strategy has to be
+    better than, one strategy a row."""
+    rows = []
+    for key in records.strategies:
+        values = alignment(records, key)
+        budget = values.shape[-1] - 1
+        interval = mean_and_interval(values[..., -1])[1:]
+        row = {"strategy": name_of(key)}
+        row |= {f"after {j}": f"{values[..., j].mean():.3f}" for j in milestones(budget)}
+        row[f"mean of 1 to {budget}"] = f"{values[..., 1:].mean():.3f}"
+        row[f"after {budget} [95%]"] = "[{:.3f}, {:.3f}]".format(*interval)
+        other = baseline_of(key, records.strategies)
+        row["held against"] = "" if other is None else name_of(other)
+        row["minus that [95%]"] = "" if other is None else _difference(records, key, other)
+        rows.append(row)
+    return tabulate(rows, headers="keys", tablefmt=style, disable_numparse=True)
+
+
+def difference_table(records: Records, style: str = "simple") -> str:
+    """Paired differences of policies and strategies of the user to all others, one a row."""
+    budget = alignment(records, records.strategies[0]).shape[-1] - 1
+    rows = []
+    for key, other in comparisons(records):
+        rows.append(
+            {
+                "strategy": name_of(key),
+                "minus": name_of(other),
+                f"after {budget}": _difference(records, key, other),
+                f"mean of 1 to {budget}": _difference(records, key, other, on_the_way=True),
+            }
+        )
+    return tabulate(rows, headers="keys", tablefmt=style, disable_numparse=True)
+
+
+def detail_table(records: Records, style: str = "simple") -> str:
+    """What else was measured, one strategy a row; the last column is a time."""
+    keys = records.strategies
+    reference = next((k for k in keys if kind_of(k) in REFERENCES), keys[0])
+    curve = alignment(records, reference).mean((0, 1, 2))
+    levels = [float(curve[j]) for j in milestones(len(curve) - 1)[-2:]]
+    humans = {key: str(alignment(records, key)[:, 0, :, 0].numel()) for key in keys}
+    rows = []
+    for key in keys:
+        row = {"strategy": name_of(key)}
+        if len(set(humans.values())) > 1:
+            row["humans"] = humans[key]
+        for level in levels:
+            row[f"reaches {level:.3f}"] = answers_to_reach(records, key, level)
+        for metric, (header, show) in DETAILS.items():
+            if metric in records.metrics:
+                row[header] = show(records.values(key, metric))
+        rows.append(row)
+    return tabulate(rows, headers="keys", tablefmt=style, disable_numparse=True)
+
+
+REFERENCES = ("greedy_information", "quantile_information")
+"""Kinds whose alignment, half way and in the end, is the level that others are to reach."""
+
+
+def _last(digits: int) -> Callable[[Tensor], str]:
+    """The mean of the last values, of (P S B H+1) or (P S B)."""
+    return lambda v: f"{(v[..., -1] if v.ndim == 4 else v).mean():.{digits}f}"
+
+
+DETAILS: dict[str, tuple[str, Callable[[Tensor], str]]] = {
+    "alignment": ("mean of cosines", _last(3)),
+    "alignment_of_mean": ("cosine of mean", _last(3)),
+    "information": ("bits", _last(2)),
+    "ess": ("ESS", lambda v: f"{(v[..., 1:] if v.ndim == 4 else v).mean():.0f}"),
+    "asked": ("asked", _last(1)),
+    "offered": ("offered", _last(1)),
+    "repeated": ("repeated", _last(1)),
+    "seconds_per_query": ("ms an ask", lambda v: f"{1000 * v.mean():.2f}"),
+    "seconds_to_choose": ("ms to choose", lambda v: f"{1000 * v.mean():.2f}"),
+}
+"""By metric: the head of its column, and the cell, from its values."""
+
+
+def feed_note(records: Records) -> list[str]:
+    """Which strategies decide on offers, where others choose from the whole pool."""
+    keys = records.strategies
+    feed = [name_of(key) for key in keys if is_feed(key, keys)]
+    if not feed or len(feed) == len(keys):
+        return []
+    verb = "decides" if len(feed) == 1 else "decide"
+    return [f"{', '.join(feed)} {verb} on the offers of a feed; the others have the whole pool", ""]
+
+
+def few_samples(records: Records) -> list[str]:
+    """A line for each strategy whose belief has at times been worth under half of its samples."""
+    lines = []
+    for key in records.strategies if "ess" in records.metrics else ():
+        ess = records.values(key, "ess")
+        if ess.ndim < 4:
+            continue
+        ess = ess.flatten(0, 2)
+        least = (ess / ess[:, :1]).amin(1)  # of the prior's, which are independent
+        if (least < 0.5).any():
+            count, worst = int((least < 0.5).sum()), ess[int(least.argmin())]
+            lines.append(
+                f"! {name_of(key)}: in {count} of {len(least)} sessions the belief was "
+                f"worth under half of its samples (least: {worst.min():.0f} of {worst[0]:.0f}); "
+                "raise belief.samples, or trust these rows less"
+            )
+    return [*lines, ""] if lines else []
+
+
+def many_repeats(records: Records) -> list[str]:
+    """A line for each policy, and strategy of the user, that repeats most of its questions."""
+    lines = []
+    for key in filter(is_judged, records.strategies):
+        asked, repeated = (
+            records.values(key, metric).mean((0, 1)) for metric in ("asked", "repeated")
+        )
+        if repeated.sum() > asked.sum() / 2:
+            lines.append(
+                f"! {name_of(key)}: {repeated.mean():.1f} of {asked.mean():.1f} questions had been "
+                "asked before; its most likely action repeats itself: evaluate with drawn actions "
+                "(policy.sample=true when it is trained), or train it further"
+            )
+    return [*lines, ""] if lines else []
+
+
+def _difference(records: Records, key: str, other: str, on_the_way: bool = False) -> str:
+    """Of alignments after the last query or, on the way, of their means over all queries."""
+    gap = difference(records, key, other)
+    mean, low, high = mean_and_interval(gap[..., 1:].mean(-1) if on_the_way else gap[..., -1])
+    return signed(mean, (low, high))

@@ -326,8 +326,8 @@ def load_policy(checkpoint: Checkpoint | str | Path, env: EnvBase) -> Policy:
     setup = "feed" if is_feed(env) else "query"
     if settings["setup"]["name"] != setup:
         raise InputError(
-            f"a policy of setup={settings['setup']['name']} cannot decide in a {setup} environment; "
-            "expected one of the setup that it was trained in"
+            f"a policy of setup={settings['setup']['name']} cannot decide in one of "
+            f"setup={setup}; expected an environment of the setup that it was trained in"
         )
     if setup == "feed" and settings["skip"] != env.skip:
         raise InputError(

@@ -9,8 +9,10 @@ from __future__ import annotations
 import inspect
 import os
 import sys
+import traceback
 from collections.abc import Callable, Mapping
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 from torchrl_pref.beliefs import BELIEFS
@@ -127,13 +129,25 @@ def load(what: str, reference: str) -> Callable[..., Any]:
                 "<module>:<name>; check the spelling, or change the folder"
             ) from None
         raise InputError(
-            f"{what}: importing {module_name} fails ({type(error).__name__}: {error}); mend it"
+            f"{what}: importing {module_name} fails ({where(error)}); mend it"
         ) from error
     found = getattr(module, name, None)
-    if not callable(found):
-        kind = f"is of type {type(found).__name__}" if hasattr(module, name) else "is not there"
+    if found is None:
         raise InputError(
-            f"{what}: {name} of {getattr(module, '__file__', module_name)} {kind}; expected a "
-            "function or a class"
+            f"{what}: {getattr(module, '__file__', module_name)} has no {name}; expected the name "
+            "of a function or class there"
+        )
+    if not callable(found):
+        raise InputError(
+            f"{what}: {name} is of type {type(found).__name__}; expected a function or a class"
         )
     return found
+
+
+def where(error: BaseException) -> str:
+    """An error and where it was raised, in one line."""
+    if isinstance(error, InputError):
+        return str(error)
+    text = " ".join(f"{type(error).__name__}: {error}".split())[:300]
+    frames = traceback.extract_tb(error.__traceback__)
+    return f"{text}, {Path(frames[-1].filename).name} line {frames[-1].lineno}" if frames else text

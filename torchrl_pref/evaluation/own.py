@@ -9,9 +9,7 @@ Only what the user typed is imported: names come from the command line and never
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 
 import torch
 from tensordict import TensorDictBase
@@ -22,7 +20,7 @@ from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.errors import InputError
 from torchrl_pref.evaluation.side_by_side import Entrant
-from torchrl_pref.groups import load
+from torchrl_pref.groups import load, where
 
 Maker = Callable[[QueryEnv | FeedEnv], TensorDictModuleBase]
 
@@ -55,7 +53,7 @@ def make_own(makers: Mapping[str, Maker], env: QueryEnv | FeedEnv, seed: int) ->
             strategy = maker(env)
         except Exception as error:
             raise InputError(
-                f"strategy={typed}: making it for a {type(env).__name__} fails ({_told(error)}); "
+                f"strategy={typed}: making it for a {type(env).__name__} fails ({where(error)}); "
                 "expected a function of the environment, or a class made with it"
             ) from error
         if not isinstance(strategy, TensorDictModuleBase):
@@ -87,15 +85,6 @@ def try_own(makers: Mapping[str, Maker], env: QueryEnv | FeedEnv) -> None:
         except Exception as error:
             raise InputError(
                 f"strategy={typed}: its first decision in a {type(env).__name__} fails "
-                f"({_told(error)}); expected a TensorDictModule that writes action, one whole "
+                f"({where(error)}); expected a TensorDictModule that writes action, one whole "
                 "number for each session"
             ) from error
-
-
-def _told(error: BaseException) -> str:
-    """An error and where it was raised, in one line."""
-    if isinstance(error, InputError):
-        return str(error)
-    text = " ".join(f"{type(error).__name__}: {error}".split())[:300]
-    frames = traceback.extract_tb(error.__traceback__)
-    return f"{text}, {Path(frames[-1].filename).name} line {frames[-1].lineno}" if frames else text

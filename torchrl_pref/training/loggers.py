@@ -2,7 +2,9 @@
 
 ``csv`` is ``training.csv``, a row for each update (:mod:`torchrl_pref.training.progress`): the
 logger of that name in TorchRL writes a file for each metric, and is not used. The others are
-TorchRL's. Each process that trains is a run of its own for ``wandb`` and ``mlflow``: a resumed training is a
+TorchRL's.
+
+Each process that trains is a run of its own for ``wandb`` and ``mlflow``: a resumed training is a
 second one, of the same name, that goes on at the update where it was resumed.
 """
 

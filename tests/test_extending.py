@@ -45,6 +45,16 @@ def test_the_main_job_runs_with_it(what: str, tmp_path: Path) -> None:
     assert "written to" in done.stdout
 
 
+def test_strategies_are_rows_of_the_table(tmp_path: Path) -> None:
+    mine = "my_strategy:most_different", "my_acquisition:least_certain"
+    small = "pool.size=40", "setup=query", "setup.budget=3", "tau=noisy", "evaluation.humans=6"
+    typed = f"strategy=[{','.join(mine)}]", f"hydra.run.dir={tmp_path / 'run'}"
+    done = run("evaluate.py", *small, *typed)
+    assert done.returncode == 0, done.stderr
+    for name in mine:
+        assert name in (tmp_path / "run" / "tables.txt").read_text()
+
+
 def test_a_checkpoint_never_names_code_to_import(tmp_path: Path) -> None:
     """What the run was made with is typed again, or is not imported."""
     folder = tmp_path / "run"

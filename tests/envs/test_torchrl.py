@@ -17,7 +17,6 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import (
-    ActionMask,
     CatTensors,
     Compose,
     ExcludeTransform,
@@ -339,6 +338,10 @@ def test_batched_environments_remember_their_humans(kind: type, use_buffers: boo
             assert fresh.any()
             assert not torch.equal(data["samples"][0], data["samples"][1])
         assert env.rollout(25).shape[:2] == (2, 3)
+        after = env.step_and_maybe_reset(env.rand_action(env.reset()))[1]
+        human = after.get("human", None)
+        assert (human is None) == (kind is SerialEnv and use_buffers)
+        assert human is None or torch.equal(human["number"], after["session", "number"])
         # With buffers of its own a Collector cannot stack what a first frame lacks.
         sizes = {"frames_per_batch": 84, "total_frames": 168}
         batches = list(Collector(env, None, use_buffers=False, **COLLECTED | sizes))
@@ -369,6 +372,13 @@ def test_sessions_without_their_humans_are_refused(pool: QueryPool) -> None:
 
 
 # Learners
+
+
+def test_policies_respect_the_mask_on_a_transformed_environment(pool: QueryPool) -> None:
+    for maker in (scorer_policy, attention_policy, paper_policy):
+        env = TransformedEnv(few(pool), StepCounter())
+        asked = env.rollout(5, maker(env).strategy)["next", "session", "history", "index"][:, -1]
+        assert all(len(row.unique()) == 5 for row in asked)
 
 
 def q_network(pool_size: int = 60) -> MLP:
@@ -417,9 +427,3 @@ def test_discrete_sac_needs_a_finite_number_for_what_is_masked(pool: QueryPool) 
     (found["loss_actor"] + found["loss_qvalue"]).backward()
     assert all(weight.grad.isfinite().all() for weight in logits.parameters())
     assert losses()["loss_actor"].isnan()  # TorchRL's own limit: 0 times minus infinity
-
-
-def test_action_mask_is_obeyed_by_random_actions(pool: QueryPool) -> None:
-    env = TransformedEnv(few(pool), ActionMask())
-    asked = env.rollout(5)["next", "session", "history", "index"][:, -1]
-    assert all(len(row.unique()) == 5 for row in asked)

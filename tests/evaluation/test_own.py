@@ -195,7 +195,7 @@ def test_a_trained_policy_is_loaded_by_one_call(kind: type, pool: QueryPool) -> 
     data = env.rollout(3, policy.strategy)
     assert not any(value.requires_grad for value in data.values(True, True))
     other = {"query": "feed", "feed": "query"}[setup]
-    with pytest.raises(InputError, match=f"a policy of setup={other} cannot decide in a"):
+    with pytest.raises(InputError, match=f"a policy of setup={other} cannot decide in one"):
         torchrl_pref.load_policy(FOLDER / f"{other}-noisy-0.pt", env)
     with pytest.raises(InputError, match="no such file"):
         torchrl_pref.load_policy("nowhere.pt", env)

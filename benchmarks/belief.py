@@ -33,7 +33,8 @@ from torchrl_pref.acquisition.functions import information_gain
 from torchrl_pref.acquisition.scoring import score_queries
 from torchrl_pref.beliefs.sampled import Belief, uniform_sphere
 from torchrl_pref.questions.choice import feature_gaps
-from torchrl_pref.questions.responses import Boltzmann, Optimal, ResponseModel
+from torchrl_pref.questions.response_model import ResponseModel
+from torchrl_pref.questions.responses import Boltzmann, Optimal
 
 ANSWERS = (1, 5, 10, 20)
 REPETITIONS = 200

@@ -25,7 +25,7 @@ from torchrl_pref.compiled import share_out
 from torchrl_pref.pool import Normalizer, QueryPool
 from torchrl_pref.questions.base import Evidence
 from torchrl_pref.questions.choice import evidence_of_gaps, feature_gaps
-from torchrl_pref.questions.responses import ResponseModel
+from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.tasks.gridworld import gridworld_pool
 
 TAU = 4.5

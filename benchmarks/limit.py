@@ -26,10 +26,10 @@ from torchrl_pref.acquisition.functions import information_gain
 from torchrl_pref.acquisition.scoring import predict_answers, score_queries
 from torchrl_pref.beliefs.resampling import FRAMES, poles_of
 from torchrl_pref.beliefs.sampled import Belief, uniform_sphere
-from torchrl_pref.beliefs.slice import ARC, MAX_SHRINKS
-from torchrl_pref.beliefs.slice_cpu import compiled_moves
+from torchrl_pref.beliefs.slice import ARC, MAX_SHRINKS, compiled_moves
 from torchrl_pref.questions.choice import feature_gaps
-from torchrl_pref.questions.responses import Boltzmann, Optimal, ResponseModel, compiled_constants
+from torchrl_pref.questions.response_model import ResponseModel
+from torchrl_pref.questions.responses import Boltzmann, Optimal, compiled_constants
 
 SESSIONS, MOVES = 100, 4
 

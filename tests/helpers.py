@@ -18,7 +18,7 @@ from torchrl_pref.humans.simulated import SimulatedHuman
 from torchrl_pref.pool import QueryPool
 from torchrl_pref.questions.base import Evidence
 from torchrl_pref.questions.choice import evidence_of_gaps
-from torchrl_pref.questions.responses import ResponseModel
+from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.strategies import RandomAsk, RandomQuery
 from torchrl_pref.training.start import make_trainer
 from torchrl_pref.training.trainer import Trainer

@@ -18,7 +18,8 @@ from torchrl_pref.acquisition.scoring import score_queries
 from torchrl_pref.beliefs.sampled import Belief
 from torchrl_pref.compiled import FEWEST, over_sessions, share_out
 from torchrl_pref.questions.choice import evidence_of_gaps
-from torchrl_pref.questions.responses import Boltzmann, Optimal, ResponseModel
+from torchrl_pref.questions.response_model import ResponseModel
+from torchrl_pref.questions.responses import Boltzmann, Optimal
 
 FAR_FROM_HERE = """
 from torchrl_pref.compiled import compiled

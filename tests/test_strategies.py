@@ -14,7 +14,7 @@ from torchrl_pref.envs.objectives import make_objective
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.errors import InputError
 from torchrl_pref.pool import QueryPool
-from torchrl_pref.questions.responses import Prediction, ResponseModel
+from torchrl_pref.questions.response_model import Prediction, ResponseModel
 from torchrl_pref.strategies import (
     REFERENCE,
     Greedy,

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from torchrl_pref.pool import Normalizer, QueryPool
     from torchrl_pref.questions.calibrate import calibrate_tau
     from torchrl_pref.questions.choice import Choice
-    from torchrl_pref.questions.responses import Boltzmann, Optimal, ResponseModel
+    from torchrl_pref.questions.response_model import ResponseModel
+    from torchrl_pref.questions.responses import Boltzmann, Optimal
     from torchrl_pref.questions.weak import Weak
     from torchrl_pref.session import Session
     from torchrl_pref.tasks.gridworld import gridworld_pool
@@ -51,7 +52,8 @@ _MODULES = {
     "pool": ("Normalizer", "QueryPool"),
     "questions.calibrate": ("calibrate_tau",),
     "questions.choice": ("Choice",),
-    "questions.responses": ("Boltzmann", "Optimal", "ResponseModel"),
+    "questions.response_model": ("ResponseModel",),
+    "questions.responses": ("Boltzmann", "Optimal"),
     "questions.weak": ("Weak",),
     "session": ("Session",),
     "tasks.gridworld": ("gridworld_pool",),

@@ -27,7 +27,8 @@ from torchrl_pref.pool import Normalizer, QueryPool
 from torchrl_pref.questions.base import Question
 from torchrl_pref.questions.calibrate import calibrate_tau
 from torchrl_pref.questions.choice import Choice
-from torchrl_pref.questions.responses import Boltzmann, Optimal, ResponseModel
+from torchrl_pref.questions.response_model import ResponseModel
+from torchrl_pref.questions.responses import Boltzmann, Optimal
 from torchrl_pref.tasks.base import make_pool
 
 Settings = dict[str, Any]

@@ -21,7 +21,7 @@ from torchrl_pref.envs.transition import REFUSED, begin, tell
 from torchrl_pref.errors import InputError, check_choice, check_count, check_seed, check_type
 from torchrl_pref.humans.simulated import SimulatedHuman
 from torchrl_pref.pool import Normalizer, QueryPool
-from torchrl_pref.questions.responses import ResponseModel
+from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.strategies import STRATEGIES, MakeStrategy
 
 FORMAT = 1

@@ -27,7 +27,7 @@ from torchrl_pref.acquisition.scoring import moments_among, predict_answers, sco
 from torchrl_pref.beliefs.per_belief import PerBelief
 from torchrl_pref.envs.transition import OPEN
 from torchrl_pref.errors import check_count, check_share
-from torchrl_pref.questions.responses import ResponseModel
+from torchrl_pref.questions.response_model import ResponseModel
 
 REFERENCE = 500
 """Queries of the pool among which a feed strategy ranks an offer."""

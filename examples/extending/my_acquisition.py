@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_pref import QueryEnv
-from torchrl_pref.questions.responses import Prediction
+from torchrl_pref.questions.response_model import Prediction
 from torchrl_pref.strategies import Greedy
 
 

@@ -12,7 +12,7 @@ from torch import Generator, Tensor
 from torchrl_pref.beliefs.base import BeliefBase, Update
 from torchrl_pref.beliefs.sampled import uniform_sphere
 from torchrl_pref.questions.base import Evidence
-from torchrl_pref.questions.responses import ResponseModel
+from torchrl_pref.questions.response_model import ResponseModel
 
 
 class Weighted(BeliefBase):

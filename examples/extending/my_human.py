@@ -13,7 +13,7 @@ from torch import Generator, Tensor
 
 from torchrl_pref.humans.base import HumanBase
 from torchrl_pref.humans.simulated import SimulatedHuman
-from torchrl_pref.questions.responses import ResponseModel
+from torchrl_pref.questions.response_model import ResponseModel
 
 
 class Tiring(HumanBase):

@@ -22,7 +22,8 @@ from torchrl_pref.acquisition.scoring import (
     together,
 )
 from torchrl_pref.beliefs.sampled import uniform_sphere
-from torchrl_pref.questions.responses import Boltzmann, Optimal, Prediction, ResponseModel
+from torchrl_pref.questions.response_model import Prediction, ResponseModel
+from torchrl_pref.questions.responses import Boltzmann, Optimal
 
 FUNCTIONS: dict[str, Acquisition] = {
     "information gain": information_gain,

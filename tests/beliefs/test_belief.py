@@ -12,7 +12,8 @@ from benchmarks.posterior import Case, compare, history
 from torchrl_pref.beliefs.resampling import kish_share
 from torchrl_pref.beliefs.sampled import RESTART_SHARE, Belief, uniform_sphere
 from torchrl_pref.questions.choice import feature_gaps
-from torchrl_pref.questions.responses import Boltzmann, Optimal, ResponseModel
+from torchrl_pref.questions.response_model import ResponseModel
+from torchrl_pref.questions.responses import Boltzmann, Optimal
 
 
 class Unknown(ResponseModel):

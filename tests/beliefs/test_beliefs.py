@@ -9,7 +9,8 @@ from torch import Generator
 
 from torchrl_pref.beliefs import BELIEFS
 from torchrl_pref.beliefs.base import BeliefBase
-from torchrl_pref.questions.responses import Boltzmann, Optimal, ResponseModel
+from torchrl_pref.questions.response_model import ResponseModel
+from torchrl_pref.questions.responses import Boltzmann, Optimal
 from torchrl_pref.questions.weak import Weak
 
 MAKE = [*BELIEFS.values(), my_belief.Weighted]

@@ -25,10 +25,10 @@ from torchrl_pref.beliefs.resampling import (
 )
 from torchrl_pref.beliefs.resampling_cpu import compiled_resample
 from torchrl_pref.beliefs.sampled import Belief, uniform_sphere
-from torchrl_pref.beliefs.slice import ARC, MAX_SHRINKS, Target, tensor_moves
-from torchrl_pref.beliefs.slice_cpu import compiled_moves
+from torchrl_pref.beliefs.slice import ARC, MAX_SHRINKS, Target, compiled_moves, tensor_moves
 from torchrl_pref.questions.choice import evidence_of_gaps, feature_gaps
-from torchrl_pref.questions.responses import Boltzmann, ResponseModel, compiled_constants
+from torchrl_pref.questions.response_model import ResponseModel
+from torchrl_pref.questions.responses import Boltzmann, compiled_constants
 
 
 @pytest.mark.parametrize("power", [1.0, 0.3])

@@ -28,7 +28,8 @@ from torchrl_pref.envs.transition import LEFT_OUT, NOT_OF_THE_POOL, OPEN
 from torchrl_pref.errors import InputError
 from torchrl_pref.humans.simulated import SimulatedHuman
 from torchrl_pref.pool import QueryPool
-from torchrl_pref.questions.responses import Boltzmann, ResponseModel
+from torchrl_pref.questions.response_model import ResponseModel
+from torchrl_pref.questions.responses import Boltzmann
 from torchrl_pref.strategies import RandomAsk, RandomQuery
 from torchrl_pref.tasks.gridworld import gridworld_pool
 

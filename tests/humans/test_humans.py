@@ -9,7 +9,8 @@ from torch import Generator
 
 from torchrl_pref.humans import HUMANS
 from torchrl_pref.humans.base import HumanBase
-from torchrl_pref.questions.responses import Boltzmann, Optimal, ResponseModel
+from torchrl_pref.questions.response_model import ResponseModel
+from torchrl_pref.questions.responses import Boltzmann, Optimal
 from torchrl_pref.questions.weak import Weak
 
 MAKE = [*HUMANS.values(), my_human.Tiring]

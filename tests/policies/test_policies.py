@@ -25,7 +25,7 @@ from torchrl_pref.policies.scorer import (
     scorer_policy,
 )
 from torchrl_pref.pool import QueryPool
-from torchrl_pref.questions.responses import ResponseModel
+from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.strategies import QuantileAsk
 
 

@@ -20,7 +20,8 @@ from torchrl_pref.pool import QueryPool
 from torchrl_pref.questions import QUESTIONS
 from torchrl_pref.questions.base import Question
 from torchrl_pref.questions.choice import Choice
-from torchrl_pref.questions.responses import Boltzmann, Optimal, ResponseModel
+from torchrl_pref.questions.response_model import ResponseModel
+from torchrl_pref.questions.responses import Boltzmann, Optimal
 from torchrl_pref.questions.weak import Weak
 
 OPTIONS = {"choice": (2, 3, 5), "weak": (2,)}

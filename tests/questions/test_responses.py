@@ -12,7 +12,8 @@ from torchrl_pref.errors import InputError
 from torchrl_pref.humans.simulated import SimulatedHuman
 from torchrl_pref.pool import QueryPool
 from torchrl_pref.questions.calibrate import calibrate_tau
-from torchrl_pref.questions.responses import Boltzmann, Optimal, ResponseModel
+from torchrl_pref.questions.response_model import ResponseModel
+from torchrl_pref.questions.responses import Boltzmann, Optimal
 
 
 @pytest.mark.parametrize("n_options", [2, 3, 5])

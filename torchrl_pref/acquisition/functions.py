@@ -12,7 +12,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torchrl_pref.questions.responses import Prediction
+from torchrl_pref.questions.response_model import Prediction
 
 Acquisition = Callable[[Prediction, Tensor], Tensor]
 """From what M belief samples (B M D) predict of the answers to C candidates to values (B C …)."""

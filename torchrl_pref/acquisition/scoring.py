@@ -18,7 +18,8 @@ from torchrl_pref.acquisition.functions import (
     volume_removal,
 )
 from torchrl_pref.acquisition.scoring_cpu import compiled_scores
-from torchrl_pref.questions.responses import Prediction, ResponseModel, compiled_constants
+from torchrl_pref.questions.response_model import Prediction, ResponseModel
+from torchrl_pref.questions.responses import compiled_constants
 
 CHUNK = 100_000
 """Returns (B c M K-1) held at once while candidates are scored: bounds memory, fits the cache."""

@@ -5,7 +5,7 @@ Shapes: S sessions, M samples, H answers, F factors of an answer, J rows of a fa
 The prior is uniform on the unit sphere: alignment ignores the scale of ω, and tau carries it.
 After each answer the samples take a step of *resample-move* (Gilks and Berzuini, 2001): reweight by
 the likelihood of the new answer, resample, then move every sample with Markov moves that leave the
-new posterior invariant (see ``sampler.py``). An answer that too few samples agree with is let in by
+new posterior invariant (see ``slice.py``). An answer that too few samples agree with is let in by
 stages, and one that hardly any sample foresaw makes the belief begin anew from the prior, see
 :meth:`Belief.update`.
 """
@@ -25,7 +25,7 @@ from torchrl_pref.beliefs.slice import Target, round_of_moves
 from torchrl_pref.config.memory import default_moves
 from torchrl_pref.errors import check_count, check_type
 from torchrl_pref.questions.base import Evidence
-from torchrl_pref.questions.responses import ResponseModel
+from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.tensors import check_finite
 
 MIN_SHARE = 0.25

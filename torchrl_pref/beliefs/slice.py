@@ -7,7 +7,7 @@ A slice sampler (Neal, 2003) restricted to a great circle through the current po
 Hasenpflug, Kodgirwar and Rudolf, *Geodesic slice sampling on the sphere*, 2023). It has no step
 size that must be right, and works for hard answers, whose likelihood is zero on one side.
 
-The move is here twice: in tensors, for any response model on any device, and in ``sampler_cpu.py``
+The move is here twice: in tensors, for any response model on any device, and in ``slice_cpu.py``
 as a compiled loop, for the models of this package on the CPU. Given the same uniforms both move a
 sample to the same place, but for rounding at the very edge of a slice.
 """
@@ -22,9 +22,11 @@ from torch import Generator, Tensor
 from torch.nn import functional as F
 
 from torchrl_pref.beliefs.resampling import FRAMES, explained_share, group_of, poles_of
-from torchrl_pref.beliefs.slice_cpu import compiled_moves
+from torchrl_pref.beliefs.slice_cpu import move_sessions
+from torchrl_pref.compiled import over_sessions
 from torchrl_pref.questions.base import Evidence
-from torchrl_pref.questions.responses import ResponseModel, compiled_constants
+from torchrl_pref.questions.response_model import ResponseModel
+from torchrl_pref.questions.responses import compiled_constants
 
 ARC = 32.0
 """Length of the arc that is searched, in standard deviations of the posterior along it. A short
@@ -156,3 +158,38 @@ def _tensor_move(samples: Tensor, poles: Tensor, uniform: Tensor, target: Target
         low, high = torch.where(ahead, low, proposal), torch.where(ahead, proposal, high)
     angle = angle.unsqueeze(-1)
     return F.normalize(samples * angle.cos() + tangents * angle.sin(), dim=-1)
+
+
+def compiled_moves(
+    samples: Tensor,
+    poles: Tensor,
+    uniform: Tensor,
+    rows: Tensor,
+    offsets: Tensor,
+    floor: Tensor,
+    slack: Tensor,
+    power: Tensor,
+    arc: float,
+    tau: float,
+    tolerance: float,
+) -> Tensor:
+    """:func:`tensor_moves` for Boltzmann and optimal humans.
+
+    Args:
+        samples: (S M D).
+        poles: (V S P D).
+        uniform: (V S M U), in [0, 1): two, and one for each shrink.
+        rows, offsets, floor: (S H F J D), (S H F J) and (S H), see ``questions.base.Evidence``.
+        slack, power: (S), see :class:`Target`.
+        arc: length of the arc that is searched, in lengths of the pole.
+        tau: what the gaps are multiplied by; infinite for answers without error.
+        tolerance: of answers without error: gaps this small are ties.
+
+    Returns:
+        (S M D), unit vectors.
+    """
+    moved = torch.empty_like(samples, memory_format=torch.contiguous_format)
+    given = samples, poles, uniform, rows, offsets, floor, slack, power, moved
+    arrays = (t.contiguous().numpy() for t in given)
+    over_sessions(move_sessions, len(samples), *arrays, arc, tau, tolerance)
+    return moved

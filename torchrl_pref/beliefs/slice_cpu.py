@@ -1,4 +1,4 @@
-"""The Markov moves of ``sampler.py`` compiled by Numba for the CPU: each session by itself.
+"""The Markov moves of ``slice.py`` compiled by Numba for the CPU: each session by itself.
 
 A sample that has found its place costs nothing more, a session's numbers never leave the cache, and
 a call for one session costs a hundredth of one for a hundred. Innermost loops run over samples, so
@@ -18,51 +18,14 @@ import math
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from torchrl_pref.compiled import compiled, over_sessions
+from torchrl_pref.compiled import compiled
 
 Array = np.ndarray[Any, np.dtype[Any]]
 
 
-def compiled_moves(
-    samples: Tensor,
-    poles: Tensor,
-    uniform: Tensor,
-    rows: Tensor,
-    offsets: Tensor,
-    floor: Tensor,
-    slack: Tensor,
-    power: Tensor,
-    arc: float,
-    tau: float,
-    tolerance: float,
-) -> Tensor:
-    """``sampler.tensor_moves`` for Boltzmann and optimal humans.
-
-    Args:
-        samples: (S M D).
-        poles: (V S P D).
-        uniform: (V S M U), in [0, 1): two, and one for each shrink.
-        rows, offsets, floor: (S H F J D), (S H F J) and (S H), see ``questions.base.Evidence``.
-        slack, power: (S), see ``sampler.Target``.
-        arc: length of the arc that is searched, in lengths of the pole.
-        tau: what the gaps are multiplied by; infinite for answers without error.
-        tolerance: of answers without error: gaps this small are ties.
-
-    Returns:
-        (S M D), unit vectors.
-    """
-    moved = torch.empty_like(samples, memory_format=torch.contiguous_format)
-    given = samples, poles, uniform, rows, offsets, floor, slack, power, moved
-    arrays = (t.contiguous().numpy() for t in given)
-    over_sessions(_move_sessions, len(samples), *arrays, arc, tau, tolerance)
-    return moved
-
-
 @compiled
-def _move_sessions(
+def move_sessions(
     first: int,
     last: int,
     samples: Array,
@@ -291,7 +254,7 @@ def _search(
 @compiled
 def _cut_arcs(arcs: Array, circles: Array, raised: Array, tolerance: float) -> None:
     """Cut arcs with these ends (2 M) to where answers without error are possible, see
-    ``responses.ResponseModel.possible_arc``."""
+    ``response_model.ResponseModel.possible_arc``."""
     n_samples = circles.shape[2]
     # Of one over the tangent of half an angle, as far as each end may go.
     above, below = np.full(n_samples, -math.inf), np.full(n_samples, -math.inf)

@@ -22,10 +22,10 @@ HELD_OUT = 2000
 """Sessions that the held-out protocol runs at once in each worker: strategies times humans."""
 
 MOVED = 2**20
-"""Moves of samples that a belief makes at once, see ``belief.py``."""
+"""Moves of samples that a belief makes at once, see ``beliefs.sampled``."""
 
 UNIFORMS = 18
-"""Random numbers of a move, see ``sampler.MAX_SHRINKS``."""
+"""Random numbers of a move, see ``beliefs.slice.MAX_SHRINKS``."""
 
 LIMIT_FILES = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 """Where Linux writes what a container may use."""

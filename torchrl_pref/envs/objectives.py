@@ -21,7 +21,7 @@ from torchrl_pref.acquisition.functions import alignment_gain, information_gain
 from torchrl_pref.acquisition.scoring import predict_answers, score_queries
 from torchrl_pref.envs.transition import Session
 from torchrl_pref.errors import check_choice
-from torchrl_pref.questions.responses import ResponseModel
+from torchrl_pref.questions.response_model import ResponseModel
 
 
 def alignment(samples: Tensor, omega: Tensor) -> Tensor:

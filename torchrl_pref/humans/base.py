@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from tensordict import TensorDict, TensorDictBase
 from torch import Generator, Tensor
 
-from torchrl_pref.questions.responses import ResponseModel
+from torchrl_pref.questions.response_model import ResponseModel
 
 
 class HumanBase(ABC):

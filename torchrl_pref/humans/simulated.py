@@ -14,7 +14,7 @@ from torch import Generator, Tensor
 from torchrl_pref.beliefs.sampled import uniform_sphere
 from torchrl_pref.errors import InputError, check_positive, check_type
 from torchrl_pref.humans.base import HumanBase
-from torchrl_pref.questions.responses import ResponseModel
+from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.tensors import check_finite
 
 

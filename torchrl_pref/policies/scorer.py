@@ -32,7 +32,7 @@ from torchrl_pref.policies.base import (
     _belief_features,
     belief_summary,
 )
-from torchrl_pref.questions.responses import ResponseModel
+from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.strategies import OfferRank, asks_over_offers
 
 N_CANDIDATE = 7

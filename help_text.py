@@ -69,13 +69,10 @@ def _groups(path: Path) -> Iterator[tuple[str, str]]:
 def _group(group: str, default: str, script: str) -> str:
     """All that a group can choose, each with its keys."""
     rows = []
-    for path in sorted(
-        (CONF / group).glob("*.yaml"), key=lambda path: (path.stem != default, path)
-    ):
-        if (script, group) == ("evaluate", "policy") and path.stem not in ("pretrained", "own"):
-            continue
-        if (script, group, path.stem) == ("train", "policy", "pretrained"):
-            continue
+    paths = sorted((CONF / group).glob("*.yaml"), key=lambda path: (path.stem != default, path))
+    for path in paths:
+        if group == "policy" and (path.stem == "pretrained") != (script == "evaluate"):
+            continue  # train.py makes policies, evaluate.py knows ours and those of checkpoints
         keys = keys_of(path)
         named = [key for key in keys if key.name == "name"]
         meaning = named[0].comment if named else " ".join(_top_comment(path).split())

@@ -67,6 +67,12 @@ def test_a_checkpoint_never_names_code_to_import(tmp_path: Path) -> None:
     assert "the run was made with policy=my_policy:perceptron" in other.stderr
     typed = run("train.py", *longer, "policy=my_policy:perceptron")
     assert typed.returncode == 0, typed.stderr
+    judged = [f"checkpoint={folder}", f"hydra.run.dir={tmp_path / 'judged'}"]
+    assert "a file names code" in run("evaluate.py", *judged).stderr
+    typed = run("evaluate.py", *judged, "policy=my_policy:perceptron")
+    assert typed.returncode == 0, typed.stderr
+    alone = run("evaluate.py", "policy=my_policy:perceptron")
+    assert "add checkpoint=<its run folder>" in alone.stderr
 
 
 @pytest.mark.parametrize(

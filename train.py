@@ -24,7 +24,7 @@ from torchrl_pref.runs import CHECKPOINT
 from torchrl_pref.storage.writing import write_text
 
 if TYPE_CHECKING:
-    from torchrl_pref.build import Task
+    from torchrl_pref.build import Problem
     from torchrl_pref.checkpoints.checkpoint import Checkpoint
     from torchrl_pref.training.trainer import Trainer
 
@@ -235,7 +235,7 @@ def check_trained(path: Path, checkpoint: Checkpoint) -> None:
         )
 
 
-def train(folder: Path, settings: dict[str, Any], task: Task, trainer: Trainer) -> float:
+def train(folder: Path, settings: dict[str, Any], task: Problem, trainer: Trainer) -> float:
     """Train, evaluate on the held-out pool, report."""
     from torchrl_pref.evaluation import comparison, reports
     from torchrl_pref.training import figure

@@ -38,7 +38,7 @@ NOISY_ACCURACY = 0.9
 
 
 @dataclass(frozen=True)
-class Task:
+class Problem:
     """What a policy is trained and judged on.
 
     Attributes:
@@ -150,7 +150,7 @@ def draw_pool(settings: Settings, seed: int) -> QueryPool:
 
 def make_task(
     train: QueryPool, test: QueryPool, tau: Any, settings: Settings | None = None
-) -> Task:
+) -> Problem:
     """Fit the normaliser on the training pool, normalise both, solve for tau.
 
     Args:
@@ -182,16 +182,16 @@ def make_task(
     else:
         solved = float(tau)
     if settings is None:
-        return Task(train, test, normalizer, solved)
+        return Problem(train, test, normalizer, solved)
     question = make("question", settings["question"])
     question.answers(train.n_options)  # or it is refused here
     lapses = (settings[section]["lapse"] for section in ("human", "belief"))
-    task = Task(train, test, normalizer, solved, question, *lapses)
+    task = Problem(train, test, normalizer, solved, question, *lapses)
     _ = task.human_model, task.response_model
     return task
 
 
-def reload_task(checkpoint: Checkpoint, train: Path, test: Path) -> Task:
+def reload_task(checkpoint: Checkpoint, train: Path, test: Path) -> Problem:
     """The task of a run from its pool files; made again from its settings where they are gone.
 
     Raises:
@@ -224,7 +224,7 @@ def reload_task(checkpoint: Checkpoint, train: Path, test: Path) -> Task:
 
 def make_query_env(
     settings: Settings,
-    task: Task,
+    task: Problem,
     pool: QueryPool,
     sessions: int,
     seed: int,
@@ -237,7 +237,7 @@ def make_query_env(
 
 
 def make_feed_env(
-    settings: Settings, task: Task, pool: QueryPool, sessions: int, seed: int
+    settings: Settings, task: Problem, pool: QueryPool, sessions: int, seed: int
 ) -> FeedEnv:
     """The feed environment on a normalised pool, by the sections ``setup`` and ``belief``."""
     setup = settings["setup"]
@@ -247,7 +247,7 @@ def make_feed_env(
 
 
 def make_training_env(
-    settings: Settings, task: Task, pool: QueryPool, sessions: int, seed: int
+    settings: Settings, task: Problem, pool: QueryPool, sessions: int, seed: int
 ) -> QueryEnv | FeedEnv:
     """The environment in which a policy of these settings learns, on a normalised pool."""
     if settings["setup"]["name"] == "feed":
@@ -257,7 +257,9 @@ def make_training_env(
     return make_query_env(settings, task, pool, sessions, seed, candidates)
 
 
-def _session_arguments(settings: Settings, task: Task, sessions: int, seed: int) -> dict[str, Any]:
+def _session_arguments(
+    settings: Settings, task: Problem, sessions: int, seed: int
+) -> dict[str, Any]:
     """What both environments are made with."""
     belief = settings["belief"]
     return {

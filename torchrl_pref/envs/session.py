@@ -48,7 +48,7 @@ from torchrl.envs import EnvBase
 from torchrl_pref.beliefs.base import BeliefBase
 from torchrl_pref.envs.objectives import make_objective
 from torchrl_pref.envs.state import check_state
-from torchrl_pref.envs.transition import Session, Tree, begin, put, rows, tell
+from torchrl_pref.envs.transition import SessionState, Tree, begin, put, rows, tell
 from torchrl_pref.errors import InputError, check_count, check_type
 from torchrl_pref.humans.base import HumanBase
 from torchrl_pref.pool import QueryPool
@@ -158,7 +158,7 @@ class SessionEnv(EnvBase):
             {**hidden, "session": session, **shown}, self.batch_size, device=self.device
         )
 
-    def _fresh(self) -> tuple[Tree, Session]:
+    def _fresh(self) -> tuple[Tree, SessionState]:
         """New humans who have answered nothing. The draws that strategies share come first."""
         size, (_, n_options, n_features) = self.batch_size.numel(), self.features.shape
         rng, n_answers = self.generator, self.human.response_model.n_answers(n_options)
@@ -173,11 +173,11 @@ class SessionEnv(EnvBase):
         """What is drawn of the questions to come, for B sessions: hidden."""
         return {}
 
-    def _counted(self, session: Session, number: Tensor) -> Session:
+    def _counted(self, session: SessionState, number: Tensor) -> SessionState:
         """Sessions that begin, with their numbers. Subclasses may add what else is counted."""
         return {**session, "number": number}
 
-    def _shown(self, session: Session, hidden: Tree) -> dict[str, Tensor]:
+    def _shown(self, session: SessionState, hidden: Tree) -> dict[str, Tensor]:
         """What a policy sees: copies, which may be rewritten. Subclasses add what is asked."""
         n_asked = session["n_asked"]
         return {
@@ -187,7 +187,7 @@ class SessionEnv(EnvBase):
             "remaining": 1 - n_asked / self.budget,
         }
 
-    def show(self, session: Session) -> TensorDict:
+    def show(self, session: SessionState) -> TensorDict:
         """What a strategy sees of sessions (B) that somebody else keeps, as a live person's."""
         shown = {**self._shown(session, {}), "session": session}
         return TensorDict(shown, self.batch_size, device=self.device)
@@ -195,11 +195,11 @@ class SessionEnv(EnvBase):
     def _put_on_table(self, shown: dict[str, Tensor], begun: Tensor | None) -> None:
         """Tell random actions what is shown now, in all sessions or where they began (B 1)."""
 
-    def _session_of(self, tensordict: TensorDictBase) -> tuple[Tree, Session]:
+    def _session_of(self, tensordict: TensorDictBase) -> tuple[Tree, SessionState]:
         """What is hidden and what is kept of the sessions in a tensordict."""
         session = {**tensordict["session"]}
         session["history"] = {**session["history"]}
-        return self._hidden_of(tensordict), cast(Session, session)
+        return self._hidden_of(tensordict), cast(SessionState, session)
 
     def _hidden_of(self, tensordict: TensorDictBase) -> Tree:
         """What is hidden of sessions: as they carry it, or else as this environment remembers it.
@@ -237,7 +237,9 @@ class SessionEnv(EnvBase):
         check_shape("action", action, self.batch_size, "one number for each session")
         return action
 
-    def _ask(self, session: Session, human: Tree, index: Tensor, asked: Tensor) -> Session:
+    def _ask(
+        self, session: SessionState, human: Tree, index: Tensor, asked: Tensor
+    ) -> SessionState:
         """The sessions after those marked in ``asked`` (B) asked pool query ``index`` (B).
 
         What stays the same is shared with the sessions before: a skip costs next to nothing.
@@ -247,11 +249,11 @@ class SessionEnv(EnvBase):
             return self._answered(session, human, index)
         after: Tree = {**session}
         if len(who):
-            part = cast(Session, rows(session, who))
+            part = cast(SessionState, rows(session, who))
             put(after, self._answered(part, rows(human, who), index[who]), who)
-        return cast(Session, after)
+        return cast(SessionState, after)
 
-    def _answered(self, session: Session, human: Tree, index: Tensor) -> Session:
+    def _answered(self, session: SessionState, human: Tree, index: Tensor) -> SessionState:
         """Sessions (B) after their humans answered pool queries ``index`` (B)."""
         options = self.features[index]
         answers = self.human.respond(options, human, session["n_asked"].squeeze(-1))
@@ -259,7 +261,7 @@ class SessionEnv(EnvBase):
 
     def _finish(
         self,
-        session: Session,
+        session: SessionState,
         hidden: Tree,
         reward: Tensor,
         truncated: Tensor,

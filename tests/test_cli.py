@@ -92,6 +92,27 @@ def test_resume_is_bit_for_bit(tmp_path: Path) -> None:
     assert untimed[0] == untimed[1]
 
 
+def test_ppo_resumes_bit_for_bit_whatever_logs(tmp_path: Path) -> None:
+    whole, parts = f"hydra.run.dir={tmp_path}/whole", f"hydra.run.dir={tmp_path}/parts"
+    tiny = ["algorithm=ppo", "setup=query", *TINY, "training.warm_up=1"]
+    run("train.py", *tiny, whole)
+    run("train.py", *tiny, "training.updates=1", "logger=[]", parts)
+    assert not {"training.csv", "tensorboard"} & set(os.listdir(tmp_path / "parts"))
+    run("train.py", f"resume={tmp_path}/parts", "training.updates=3", "logger=[csv]")
+    first, second = (Checkpoint.load(tmp_path / name) for name in ("whole", "parts"))
+    assert first.settings["algorithm"]["name"] == "ppo"
+    for key, value in first.weights.items():
+        assert torch.equal(value, second.weights[key])
+    tables = []
+    for name in ("whole", "parts"):
+        with (tmp_path / name / "training.csv").open() as file:
+            tables.append([{**row, "frames_per_second": ""} for row in csv.DictReader(file)])
+    for row in (*tables[0], *tables[1]):  # evaluations are spread over the updates asked for
+        for column in [column for column in row if column.startswith("held_out")]:
+            del row[column]
+    assert tables[0] == tables[1]
+
+
 def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     long = ["training.updates=100000", "training.save_every=1"]
@@ -275,6 +296,13 @@ BAD_INPUT = [
     ("train", "policy=attention policy.tokens=all", "policy.tokens='all': expected one of"),
     ("train", "human.spread=0.5", "human.spread=0.5: expected a factor of at least 1"),
     ("train", "training.warm_up=-1", "training.warm_up=-1: expected a whole number"),
+    ("train", "algorithm=dqn", "Could not find 'algorithm/dqn'"),
+    ("train", "algorithm.name=ppo", "type algorithm=ppo"),
+    ("train", "algorithm=ppo algorithm.epochs=0", "algorithm.epochs=0: expected a whole number"),
+    ("train", "algorithm=ppo algorithm.clip_epsilon=2", "algorithm.clip_epsilon=2: expected a"),
+    ("train", "+algorithm.epochs=2", "no such key here, with setup=feed and policy=scorer and alg"),
+    ("train", "logger=csv", "logger='csv': expected a list, such as logger=[csv,tensorboard]"),
+    ("train", "logger=[csv,paper]", "logger='paper': expected one of csv, tensorboard, wandb"),
     ("evaluate", "protocol=all", "protocol='all': expected one of heldout"),
     ("evaluate", "policy=best", "Could not find 'policy/best'"),
     ("evaluate", "policy=scorer", "policy='scorer': expected one of pretrained"),

@@ -299,7 +299,7 @@ BAD_INPUT = [
     ("train", "task=my_task:Nothing", "my_task.py has no Nothing; expected the name"),
     ("train", "task=nowhere:Table", "no module nowhere in"),
     ("train", "task=my_task:torch", "torch is of type module; expected a function or a class"),
-    ("train", "task=own", "task.make"),
+    ("train", "task=own", "expected <module>:<name>"),
     ("train", "human=my_human:Tiring human.patients=3", "unexpected keyword argument 'patients'"),
     ("train", "question=weak question.threshold=-1", "question.threshold=-1: expected a finite"),
     ("train", "question=weak pool.options=3", "a weak question about 3 options: expected 2"),

@@ -36,9 +36,13 @@ def test_shipped_policies_are_brought_up_to_date(path: Path) -> None:
     assert checkpoint.settings["logger"] == ["csv", "tensorboard"]
     assert checkpoint.settings["evaluation"]["during"] == 0
     assert same(checkpoint.weights, raw["weights"])
+    assert checkpoint.settings["task"] == {"name": "gridworld", **raw["settings"]["grid"]}
+    assert checkpoint.settings["human"]["spread"] == raw["settings"]["tau_spread"]
+    assert checkpoint.settings["question"] == {"name": "choice"}
     for key, value in raw["settings"].items():
-        if key != "evaluation":
-            assert checkpoint.settings[key] == value
+        if key not in ("evaluation", "grid", "tau_spread"):
+            now = checkpoint.settings[key]
+            assert (now | value if isinstance(value, dict) else value) == now
     progress = Progress.of(checkpoint.training)
     assert progress.update == len(raw["training"]["history"]["train/reward"])
     for name, values in progress.history.items():
@@ -50,8 +54,14 @@ def aged(checkpoint: Path) -> None:
     """Make a checkpoint what format 4 wrote."""
     content = torch.load(checkpoint, weights_only=True)
     content["format"] = 4
-    for key in ("algorithm", "logger"):
-        del content["settings"][key]
+    settings = content["settings"]
+    for key in ("algorithm", "logger", "question"):
+        del settings[key]
+    settings["grid"] = {key: settings["task"][key] for key in ("size", "length")}
+    settings["tau_spread"] = settings["human"]["spread"]
+    settings["belief"] = {key: settings["belief"][key] for key in ("samples", "moves")}
+    for key in ("task", "human"):
+        del settings[key]
     for name in ADDED_CURVES:
         del content["training"]["history"][name]
     torch.save(content, checkpoint)

@@ -13,7 +13,6 @@ import pytest
 import torch
 from config.test_settings import composed
 from hydra.core.override_parser.overrides_parser import OverridesParser
-
 from omegaconf import OmegaConf
 from test_cli import keys_of
 

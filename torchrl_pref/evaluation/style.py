@@ -172,7 +172,7 @@ def legend_above(figure: Figure, styles: Mapping[str, Style]) -> None:
         for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
     shown = [key for key in styles if key in handles]
-    columns = max(1, int(figure.get_figwidth() // 2.6))
+    columns = max(1, int(figure.get_figwidth() // 2.5))
     figure.legend(
         handles=[handles[key] for key in shown],
         labels=[styles[key].name for key in shown],

@@ -17,7 +17,9 @@ from omegaconf import OmegaConf
 from test_cli import keys_of
 
 import typed
+from benchmarks import docs_figures
 from torchrl_pref.config.settings import check_evaluate_settings, check_train_settings
+from torchrl_pref.evaluation.records import Entry, Records
 
 ROOT = Path(__file__).parents[1]
 CARD = ROOT / "torchrl_pref" / "policies" / "weights" / "README.md"
@@ -168,3 +170,48 @@ def test_code_compiles_and_runs(
         if runs:
             exec(compiled, names)
     torch.set_num_threads(threads)
+
+
+ENDS = ("begin", "end")
+
+
+def test_every_table_between_marks_is_made_by_a_part() -> None:
+    for page in PAGES:
+        text = page.read_text()
+        begun, ended = (re.findall(rf"^<!-- {end}: (\S+) -->$", text, re.M) for end in ENDS)
+        assert begun == ended
+        parts = [part for part, made in docs_figures.PARTS.items() if ROOT / made.page == page]
+        assert {mark.partition("-")[0] for mark in begun} <= set(parts)
+    with pytest.raises(ValueError, match="no <!-- begin: nothing -->"):
+        docs_figures.between("", "nothing", "")
+    page = "a\n<!-- begin: x -->\nold\n<!-- end: x -->\nb"
+    assert docs_figures.between(page, "x", "new") == page.replace("old", "new")
+
+
+@pytest.mark.parametrize("name", docs_figures.PARTS)
+def test_parts_of_the_docs_are_made_by_commands_that_are_accepted(name: str) -> None:
+    for line in docs_figures.PARTS[name].commands:
+        command, _, left = line.partition(" -> ")
+        assert left
+        script = ROOT / command.split()[1]
+        assert script.exists()
+        if script.parent == ROOT:
+            test_commands_are_accepted(ROOT, command.format(folder="x").partition(" ")[2])
+
+
+def test_a_cell_of_the_protocol_is_a_table() -> None:
+    """Two pools of five humans: the policy is .1 ahead of greedy, which faces three of them."""
+    entries = []
+    for key, level, humans in (("greedy_information", 0.5, 3), ("policy_query", 0.6, 5)):
+        numbers = {n: torch.ones(humans) for n in ("information", "repeated", "offered")}
+        values = {"alignment": torch.full((humans, 5), level), **numbers}
+        values["seconds_to_choose"] = torch.tensor(0.001)
+        entries += [
+            Entry("heldout", "query/noisy/corners", pool, 0, key, values) for pool in ("0", "1")
+        ]
+    greedy, policy = docs_figures.heldout_rows(Records(entries))
+    assert greedy["RL minus it, after 4"] == "+0.100 [+0.100, +0.100]"
+    assert greedy["strategy"].endswith("3 humans a pool")
+    assert policy["strategy"] == "**RL**"
+    assert policy["reaches 0.500 after"] == "0"
+    assert docs_figures.table([greedy, policy]).startswith("| strategy ")

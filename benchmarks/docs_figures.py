@@ -325,9 +325,10 @@ def between(text: str, mark: str, content: str) -> str:
 def overview(names: list[str]) -> str:
     """What each part makes, and how long it takes."""
     rows = [{"part": n, "minutes": f"{PARTS[n].minutes:g}", "page": PARTS[n].page} for n in names]
-    total = sum(PARTS[name].minutes for name in names) / 60
+    total = sum(PARTS[name].minutes for name in names)
+    time = f"{total / 60:.1f} hours" if total > 60 else f"{total:g} minutes"
     lines = tabulate(rows, headers="keys", disable_numparse=True)
-    return f"{lines}\n\n{total:.1f} hours in all on two idle cores, less what is there already"
+    return f"{lines}\n\n{time} in all on two idle cores, less what is there already"
 
 
 def main() -> None:
@@ -346,7 +347,7 @@ def main() -> None:
         return
     os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     total = sum(PARTS[name].minutes for name in names)
-    form = "{desc}: {percentage:3.0f}% |{bar}| {elapsed}"
+    form = "{desc}{percentage:3.0f}% |{bar}| {elapsed}"
     with tqdm(total=total, bar_format=form) as bar:
         for name in names:
             bar.set_description(name)

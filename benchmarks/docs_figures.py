@@ -299,9 +299,9 @@ def make(name: str, folder: Path) -> None:
         command, _, left = line.partition(" -> ")
         if not (folder / left).exists():
             words = shlex.split(command.format(folder=folder))
+            stamp.write_text(commit())
             tqdm.write(f"{name}: {shlex.join(words)}")
             subprocess.run([sys.executable, *words[1:]], cwd=ROOT, check=True)
-            stamp.write_text(commit())
     page = ROOT / part.page
     text = page.read_text()
     for mark, content in part.write(folder).items():

@@ -1,7 +1,6 @@
 PYTHON ?= python3
-ARGS ?= setup=feed tau=noisy
 
-.PHONY: install train test lint
+.PHONY: install train test lint docs-figures
 
 install: .venv/installed
 
@@ -10,6 +9,7 @@ install: .venv/installed
 	.venv/bin/python -m pip install -c constraints.txt -e ".[dev]"
 	touch $@
 
+train: ARGS ?= setup=feed tau=noisy
 train: install
 	.venv/bin/python train.py $(ARGS)
 
@@ -20,3 +20,7 @@ lint: install
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
+
+# All of it takes hours; it says how long first. A part: make docs-figures ARGS="--only heldout"
+docs-figures: install
+	.venv/bin/python benchmarks/docs_figures.py $(ARGS)

@@ -176,7 +176,9 @@ def run(default: Point, letter: str, sizes: Sequence[int], repeats: int) -> list
 
 def draw(rows: Sequence[Row], path: Path) -> None:
     """Time above and memory below, choosing on the left and updating on the right."""
-    figure, axes = plt.subplots(2, 2, figsize=(11, 8), sharex="col", sharey="row")
+    figure, axes = plt.subplots(
+        2, 2, figsize=(11, 9), sharex="col", sharey="row", layout="constrained"
+    )
     titles = {
         "choose": f"choosing a query\nN = {CHOOSE.N} ({FEW.N} for B), M = 100, B = 1, D = 4, K = 2",
         "update": f"updating the belief\nM = 100, B = {UPDATE.B}, D = 4, K = 2, H = {UPDATE.H}",
@@ -190,15 +192,14 @@ def draw(rows: Sequence[Row], path: Path) -> None:
                     x, y = ([row[field] for row in own] for field in (letter, key))
                     label = f"{letter} {name}, slope {own[-1]['slope']:.2f}"
                     axis.plot(x, y, color=f"C{i}", marker="os^Dvp"[i], label=label)
-        column[0].set_title(title)
-        column[0].legend()
+        place = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0)}  # above: it covers nothing
+        column[0].legend(title=title, ncols=2, frameon=False, **place)
         column[1].set_xlabel("size of what is varied, the others as in the title")
     axes[0, 0].set_ylabel("CPU seconds, one thread")
     axes[1, 0].set_ylabel("peak memory of the call, MiB")
     for axis in axes.flat:
         axis.set(xscale="log", yscale="log")
         axis.grid(alpha=0.25)
-    figure.tight_layout()
     figure.savefig(path, dpi=150)
     print(f"plot written to {path}")
 

@@ -62,7 +62,7 @@ def test_train_evaluate_and_resume(tmp_path: Path) -> None:
     assert list((folder / "tensorboard").glob("events*"))
     for row in ("random", "greedy information gain", "ask all", "RL-feed"):
         assert re.search(rf"^{re.escape(row)} +-?\d\.\d+ +-?\d\.\d+ +-?\d\.\d+", output, re.M)
-    assert "noisy user (tau=" in output
+    assert "noisy human (tau=" in output
     assert "only the critic learns in the first training.warm_up=10 updates" in output
 
     output = run("evaluate.py", f"checkpoint={folder}", "evaluation.humans=7", cwd=tmp_path)
@@ -151,7 +151,7 @@ def test_sweep_makes_one_table(tmp_path: Path) -> None:
     assert "RL (sweep/0)" in output
     assert "RL (other/0)" in output
     output = run("evaluate.py", f"checkpoint={tmp_path}/sweep", f"hydra.run.dir={tmp_path}/all")
-    for row in ("optimal user", "noisy user (tau=0.5)", "RL ", "RL-feed"):
+    for row in ("optimal human", "noisy human (tau=0.5)", "RL ", "RL-feed"):
         assert row in output
     assert (tmp_path / "all" / "figure_2.png").exists()
 
@@ -183,7 +183,7 @@ def test_attention_experiment(tmp_path: Path) -> None:
 
 def test_evaluate_compares_the_baselines(tmp_path: Path) -> None:
     output = run("evaluate.py", *TINY_TASK, f"hydra.run.dir={tmp_path}")
-    for row in ("optimal user", "noisy user", "random", "greedy", "cosine of mean", "repeated"):
+    for row in ("optimal human", "noisy human", "random", "greedy", "cosine of mean", "repeated"):
         assert row in output
     with (tmp_path / "curves.csv").open() as file:
         rows = list(csv.DictReader(file))

@@ -61,7 +61,7 @@ class Problem:
     @property
     def title(self) -> str:
         """What kind of human this is, for tables and figures."""
-        return "optimal user" if self.tau is None else f"noisy user (tau={self.tau:.4g})"
+        return "optimal human" if self.tau is None else f"noisy human (tau={self.tau:.4g})"
 
     @property
     def response_model(self) -> ResponseModel:

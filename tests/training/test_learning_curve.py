@@ -192,7 +192,7 @@ def test_report_says_what_was_learned(
     name = "quantile" if setup == "feed" else "greedy alignment"
     progress = Progress.of(pretrained_checkpoint(setup, "noisy").training)
     assert (progress.held_out, progress.baseline) == ({}, None)  # of version 0.1.0
-    write_training(tmp_path, [Training("policy_query", "noisy user", progress)])
+    write_training(tmp_path, [Training("policy_query", "noisy human", progress)])
     plain = (tmp_path / "training.png").read_bytes()
     progress = Progress(
         progress.update, progress.history, {0: start, 50: start, 100: start + gain}, (name, start)
@@ -204,7 +204,7 @@ def test_report_says_what_was_learned(
     )
     assert f": +0.100 [{low:+.3f}, {high:+.3f}]; minus" in line
     capsys.readouterr()
-    write_training(tmp_path, [Training("policy_query", "noisy user", progress)])
+    write_training(tmp_path, [Training("policy_query", "noisy human", progress)])
     assert f"RL: {line}" in capsys.readouterr().out
     assert (tmp_path / "training.png").read_bytes() != plain
 
@@ -215,5 +215,5 @@ def test_the_shortest_training_has_a_figure(setup: str, during: int, tmp_path: P
     """One update, in which no episode ended."""
     trainer, curve, _, _ = watched(during, setup, updates=1)
     trainer.run(tmp_path, lambda: None, curve.measure)
-    write_training(tmp_path, [Training("policy_query", "noisy user", trainer.progress)])
+    write_training(tmp_path, [Training("policy_query", "noisy human", trainer.progress)])
     assert (tmp_path / "training.png").stat().st_size > 5000

@@ -47,7 +47,7 @@ def run_protocol(
     are over groups, and tell of other humans on that pool and not of other pools.
 
     Args:
-        settings: the sections ``grid``, ``pool``, ``belief``, ``setup`` and ``device``.
+        settings: the sections ``task``, ``pool``, ``belief``, ``setup`` and ``device``.
         learned: the policies of each cell, of any kinds and training seeds.
         workers: processes that run pools side by side, one CPU thread each.
         own: strategies of the user, ``module:name`` of each; they face every cell.

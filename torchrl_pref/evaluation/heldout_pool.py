@@ -94,7 +94,7 @@ class Job:
     """One pool of one cell, to be run by a worker process.
 
     Attributes:
-        settings: the sections ``grid``, ``pool``, ``belief``, ``setup`` and ``device``.
+        settings: the sections ``task``, ``pool``, ``belief``, ``setup`` and ``device``.
         cell, pool: which; ``pool`` is a number.
         learned: the policies of each kind by key, one for each training seed.
         thresholds: in bits, of the feed's threshold rules.

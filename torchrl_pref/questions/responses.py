@@ -31,7 +31,7 @@ from torchrl_pref.questions.choice import Choice
 from torchrl_pref.questions.response_model import Prediction, ResponseModel
 
 MAX_TAU = 1e30
-"""Larger and a product with a return is beyond float32; 10⁶ is an optimal user already."""
+"""Larger and a product with a return is beyond float32; 10⁶ is an optimal human already."""
 
 
 @final

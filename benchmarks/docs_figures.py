@@ -1,0 +1,360 @@
+"""Make again what the README and docs/ show: figures, tables between marks, and their CSV files.
+
+``make docs-figures``, or ``python benchmarks/docs_figures.py [--only NAME[,NAME]] [--list]``. Each
+part is the commands that the page states, as processes of their own, in folders under
+``multirun/docs`` (or ``--folder``). ``--list`` says what there is and how long each part takes, on
+two idle cores. What a command already left in that folder is used and not made again, so that a
+stopped run goes on and a table or figure can be written anew from its records: remove a part's
+folder to measure it again.
+
+A table stands in its page between ``<!-- begin: NAME -->`` and ``<!-- end: NAME -->``; the first
+line says which commit made it. What is between is replaced, and nothing else.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[0] = str(ROOT)  # this folder's select.py hides Python's
+
+import argparse
+import csv
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+from tabulate import tabulate
+from torch import Tensor
+from tqdm import tqdm
+
+from torchrl_pref.evaluation.figures import figure_1, heldout_figure
+from torchrl_pref.evaluation.records import CSV, Records, read_records
+from torchrl_pref.evaluation.style import is_feed, is_judged, kind_of, name_of
+from torchrl_pref.evaluation.tables import signed, title_of
+from torchrl_pref.evaluation.views import (
+    alignment,
+    answers_to_reach,
+    difference,
+    mean_and_interval,
+    milestones,
+)
+
+DOCS = ROOT / "docs"
+
+Rows = list[dict[str, str]]
+
+
+class Part(NamedTuple):
+    """Something that the docs show.
+
+    Attributes:
+        page: where its tables stand.
+        commands: what is run, with ``{folder}`` for the part's own folder. The file after ``->`` is
+            what the command leaves there: where it exists the command is not run again.
+        minutes: that it takes on two idle cores.
+        write: from the part's folder, the tables by the name of their marks; makes its figures.
+    """
+
+    page: str
+    commands: tuple[str, ...]
+    minutes: float
+    write: Callable[[Path], dict[str, str]]
+
+
+def table(rows: Rows) -> str:
+    """As Markdown."""
+    return tabulate(rows, headers="keys", tablefmt="pipe", disable_numparse=True)
+
+
+def benchmark(name: str) -> Callable[[Path], dict[str, str]]:
+    """The table that a benchmark left as JSON."""
+
+    def write(folder: Path) -> dict[str, str]:
+        found = json.loads((folder / f"{name}.json").read_text())
+        if (folder / f"{name}.png").exists():
+            shutil.copy(folder / f"{name}.png", DOCS)
+        rows = [{key: cell(value) for key, value in row.items()} for row in found["rows"]]
+        return {name: f"{found['title']}; {found['machine']}.\n\n{table(rows)}"}
+
+    return write
+
+
+def cell(value: Any) -> str:
+    """Three digits of a number, and all of a whole one."""
+    if isinstance(value, float):
+        return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
+    return f"{value:,}" if isinstance(value, int) else str("" if value is None else value)
+
+
+def pretrained(folder: Path) -> dict[str, str]:
+    """The first figure of the README."""
+    figure_1(read_records(folder / CSV), DOCS / "pretrained.png")
+    return {}
+
+
+def heldout(folder: Path) -> dict[str, str]:
+    """A table for each cell of the protocol, its figure, and its curves."""
+    records = read_records(folder / CSV)
+    heldout_figure(records, DOCS / "heldout.png")
+    with (DOCS / "heldout.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["task", "strategy", "queries", "mean", "low", "high"])
+        for task in records.tasks:
+            own = records.of_task(task)
+            for key in own.strategies:
+                for query, column in enumerate(alignment(own, key).unbind(-1)):
+                    numbers = (f"{number:.5f}" for number in mean_and_interval(column))
+                    writer.writerow([task, key, query, *numbers])
+    return {
+        f"heldout-{task.replace('/', '-')}": table(heldout_rows(records.of_task(task)))
+        for task in records.tasks
+    }
+
+
+def heldout_rows(records: Records) -> Rows:
+    """A line for each strategy of one cell, with the policy's paired difference to it."""
+    policy = next(key for key in records.strategies if is_judged(key))
+    information = next(k for k in records.strategies if kind_of(k).endswith("_information"))
+    _, half, budget = milestones(alignment(records, policy).shape[-1] - 1)
+    level = float(alignment(records, information).mean((0, 1, 2))[half])
+    rows = []
+    for key in records.strategies:
+        values, gap = alignment(records, key), difference(records, policy, key)
+        few = values.shape[2] < alignment(records, policy).shape[2]
+        name = f"{name_of(key)}, {values.shape[2]} humans a pool" if few else name_of(key)
+        row = {
+            "strategy": f"**{name}**" if key == policy else name,
+            f"after {half}": f"{values[..., half].mean():.3f}",
+            f"after {budget}": f"{values[..., -1].mean():.3f}",
+            f"mean of 1 to {budget}": f"{values[..., 1:].mean():.3f}",
+            f"RL minus it, after {budget}": "" if key == policy else interval(gap[..., -1]),
+            "RL minus it, mean": "" if key == policy else interval(gap[..., 1:].mean(-1)),
+            f"reaches {level:.3f} after": answers_to_reach(records, key, level),
+            "bits": f"{records.values(key, 'information').mean():.2f}",
+        }
+        if is_feed(key, records.strategies):
+            row["offers seen"] = f"{records.values(key, 'offered').mean():.0f}"
+        else:
+            row["repeats"] = f"{records.values(key, 'repeated').mean():.1f}"
+        row["ms to choose"] = f"{1000 * records.values(key, 'seconds_to_choose').mean():.2f}"
+        rows.append(row)
+    return rows
+
+
+def interval(gap: Tensor) -> str:
+    """Mean of paired differences, with its 95% interval."""
+    mean, low, high = mean_and_interval(gap)
+    return signed(mean, (low, high))
+
+
+def paper(folder: Path) -> dict[str, str]:
+    """The paper's two figures, final alignments, and the differences that its claims are about."""
+    records = read_records(folder / "evaluation" / CSV)
+    figure_1(records, DOCS / "figure_1.png")
+    shutil.copy(folder / "evaluation" / "figure_2.png", DOCS)
+    final, apart = [], []
+    for key in records.strategies:
+        row, other_row = {"alignment after 20 queries": name_of(key)}, {"minus": name_of(key)}
+        for task in records.tasks:
+            own, title = records.of_task(task), title_of(task)
+            row[title] = f"{alignment(own, key)[..., -1].mean():.3f}"
+            for policy in filter(is_judged, own.strategies):
+                gap = difference(own, policy, key)[..., -1]
+                other_row[f"{name_of(policy)}, {title}"] = interval(gap)
+        final.append(row)
+        if kind_of(key) in ("random", "greedy_information"):
+            apart.append(other_row)
+    return {"paper": f"{table(final)}\n\n{table(transposed(apart))}"}
+
+
+def transposed(rows: Rows) -> Rows:
+    """Columns as rows: what has many of them is read better so."""
+    head, *names = rows[0]
+    return [{"": name, **{f"{head} {row[head]}": row[name] for row in rows}} for name in names]
+
+
+def objectives(folder: Path) -> dict[str, str]:
+    """What an objective is worth, and what is learned from nothing: one training of each."""
+    rows = []
+    for run in ("control", "started", "mean", "covariance", "samples"):
+        records = read_records(folder / f"{run}-evaluated" / CSV)
+        for key in (
+            records.strategies if run == "control" else filter(is_judged, records.strategies)
+        ):
+            gap = difference(records, key, "greedy_information")[..., -1]
+            row = {"strategy": f"{name_of(key)}, {run}" if is_judged(key) else name_of(key)}
+            values = alignment(records, key)
+            row |= {f"after {j}": f"{values[..., j].mean():.3f}" for j in milestones(20)}
+            row["minus greedy information gain, last"] = interval(gap)
+            rows.append(row)
+    return {"objectives": table(rows)}
+
+
+TRAIN, EVALUATE = "python train.py setup=query tau=noisy", "evaluation.humans=300"
+
+
+def trained(name: str, *settings: str) -> Iterator[str]:
+    """A training, and its evaluation on 300 humans."""
+    run = f"{{folder}}/{name}"
+    yield f"{TRAIN} {' '.join(settings)} hydra.run.dir={run} -> {name}/tables.txt"
+    evaluation = f"python evaluate.py checkpoint={run} {EVALUATE} hydra.run.dir={run}-evaluated"
+    yield f"{evaluation} -> {name}-evaluated/{CSV}"
+
+
+def measured(name: str, page: str, minutes: float, more: str = "") -> Part:
+    """A benchmark that writes its table as JSON."""
+    command = f"python benchmarks/{name}.py {more} --json {{folder}}/{name}.json -> {name}.json"
+    return Part(page, (command,), minutes, benchmark(name))
+
+
+SWEEP = "hydra.sweep.dir={folder}/sweep"
+CELLS = [f"{setup}-{tau}" for setup in ("feed", "query") for tau in ("noisy", "optimal")]
+START = "policy.start=information_gain training.learning_rate=0.01 training.updates=200"
+
+PARTS: dict[str, Part] = {
+    "pretrained": Part(
+        "README.md",
+        (f"python evaluate.py policy=pretrained setup=query hydra.run.dir={{folder}} -> {CSV}",),
+        0.5,
+        pretrained,
+    ),
+    "heldout": Part(
+        "docs/results.md",
+        (f"python evaluate.py protocol=heldout hydra.run.dir={{folder}} -> {CSV}",),
+        12,
+        heldout,
+    ),
+    "paper": Part(
+        "docs/paper.md",
+        (
+            f"python train.py -m setup=query,feed tau=noisy,optimal experiment=paper {SWEEP} "
+            "-> sweep/3/tables.txt",
+            "python evaluate.py checkpoint={folder}/sweep hydra.run.dir={folder}/evaluation "
+            f"-> evaluation/{CSV}",
+        ),
+        35,
+        paper,
+    ),
+    "objectives": Part(
+        "docs/results.md",
+        (
+            *trained("control", "objective=information_gain"),
+            *trained("started", START),
+            *trained("mean", "experiment=attention policy.tokens=mean"),
+            *trained("covariance", "experiment=attention policy.tokens=covariance"),
+            *trained("samples", "experiment=attention policy.tokens=samples"),
+        ),
+        80,
+        objectives,
+    ),
+    "quality": Part(
+        "docs/results.md",
+        (
+            "python benchmarks/main_job.py --folder {folder}/runs -> runs/query-optimal/tables.txt",
+            f"python benchmarks/quality.py {' '.join(f'{{folder}}/runs/{c}' for c in CELLS)} "
+            "--json {folder}/quality.json -> quality.json",
+        ),
+        20,
+        benchmark("quality"),
+    ),
+    "select": measured("select", "docs/speed.md", 3),
+    "limit": measured("limit", "docs/speed.md", 2),
+    "belief": measured("belief", "docs/speed.md", 10),
+    "session": measured("session", "docs/speed.md", 2),
+    "scale": measured("scale", "docs/speed.md", 5, "--plot {folder}/scale.png"),
+    "train": measured("train", "docs/speed.md", 10),
+    "main_job": measured("main_job", "docs/speed.md", 7),
+    "dimension": measured("dimension", "docs/robustness.md", 30, "--features 8,16,32"),
+}
+"""In the order in which they are made. The minutes of ``pretrained``, ``heldout`` and ``main_job``
+were measured, those of trainings follow from what one takes, and those of the other benchmarks are
+estimates. What ``posterior.py`` (hours), ``versions.py`` (needs an earlier checkout),
+``bad_settings.py``, ``bad_files.py`` and ``kills.py`` print is copied into the pages by hand."""
+
+
+def commit() -> str:
+    """The commit that the working tree is at, and whether there is more in it."""
+
+    def git(*arguments: str) -> str:
+        line = ["git", *arguments]
+        return subprocess.run(line, cwd=ROOT, capture_output=True, text=True).stdout.strip()
+
+    changed = git("status", "--porcelain", "--untracked-files=no", "--", "torchrl_pref", "conf")
+    return (git("rev-parse", "--short", "HEAD") or "unknown") + (" with changes" if changed else "")
+
+
+def make(name: str, folder: Path) -> None:
+    """Run what is missing of a part, and write it into its page."""
+    part, folder = PARTS[name], folder / name
+    folder.mkdir(parents=True, exist_ok=True)
+    stamp = folder / "commit.txt"
+    for line in part.commands:
+        command, _, left = line.partition(" -> ")
+        if not (folder / left).exists():
+            words = shlex.split(command.format(folder=folder))
+            stamp.write_text(commit())
+            tqdm.write(f"{name}: {shlex.join(words)}")
+            subprocess.run([sys.executable, *words[1:]], cwd=ROOT, check=True)
+    page = ROOT / part.page
+    text = page.read_text()
+    for mark, content in part.write(folder).items():
+        text = between(text, mark, f"*Made at commit {stamp.read_text()}.*\n\n{content}")
+    page.write_text(text)
+
+
+def between(text: str, mark: str, content: str) -> str:
+    """A page with something else between two marks.
+
+    Raises:
+        ValueError: the page has no such marks.
+    """
+    begin, end = f"<!-- begin: {mark} -->\n", f"\n<!-- end: {mark} -->"
+    found = re.compile(re.escape(begin) + ".*?" + re.escape(end), re.S)
+    if not found.search(text):
+        raise ValueError(f"no {begin.strip()} … {end.strip()} in the page")
+    return found.sub(lambda _: f"{begin}{content}{end}", text)
+
+
+def overview(names: list[str]) -> str:
+    """What each part makes, and how long it takes."""
+    rows = [{"part": n, "minutes": f"{PARTS[n].minutes:g}", "page": PARTS[n].page} for n in names]
+    total = sum(PARTS[name].minutes for name in names)
+    time = f"{total / 60:.1f} hours" if total > 60 else f"{total:g} minutes"
+    lines = tabulate(rows, headers="keys", disable_numparse=True)
+    return f"{lines}\n\n{time} in all on two idle cores, less what is there already"
+
+
+def main() -> None:
+    """Say how long it takes, and make it."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--only", help=f"parts, by commas: {', '.join(PARTS)}")
+    parser.add_argument("--list", action="store_true", help="say what there is, and stop")
+    parser.add_argument("--folder", type=Path, default=ROOT / "multirun" / "docs")
+    typed = parser.parse_args()
+    names = typed.only.split(",") if typed.only else list(PARTS)
+    for name in names:
+        if name not in PARTS:
+            parser.error(f"--only {name}: expected some of {', '.join(PARTS)}")
+    print(overview(names), flush=True)
+    if typed.list:
+        return
+    os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    total = sum(PARTS[name].minutes for name in names)
+    form = "{desc}{percentage:3.0f}% |{bar}| {elapsed}"
+    with tqdm(total=total, bar_format=form) as bar:
+        for name in names:
+            bar.set_description(name)
+            make(name, typed.folder.absolute())
+            bar.update(PARTS[name].minutes)
+    print("written; look at the figures, and at git diff docs README.md")
+
+
+if __name__ == "__main__":
+    main()

@@ -118,7 +118,7 @@ def allow_typed(settings: dict[str, Any]) -> None:
 
 
 def refuse_other_code(settings: dict[str, Any], new: dict[str, Any]) -> None:
-    """Refuse code of the user's own that a run was not made with.
+    """Refuse code of the user's own, or settings of it, that a run was not made with.
 
     Args:
         settings: of the run.
@@ -135,6 +135,13 @@ def refuse_other_code(settings: dict[str, Any], new: dict[str, Any]) -> None:
                     f"{group}={here}: the run was made with {group}="
                     f"{there or settings[group]['name']}; type that, or leave {group} out"
                 )
+            for key, value in new[group].items():
+                known = settings[group].get(key)
+                if typed.was_typed(f"{group}.{key}") and value != known:
+                    raise InputError(
+                        f"{group}.{key}={value}: the run was made with {group}.{key}={known}; "
+                        f"leave {group}.{key} out"
+                    )
 
 
 def check_groups(settings: dict[str, Any]) -> None:

@@ -53,8 +53,9 @@ def check(settings: dict[str, Any]) -> None:
     """
     check_train_settings(settings)
     app.allow_typed(settings)
-    app.check_groups(settings)
-    if settings["resume"] is not None:
+    if settings["resume"] is None:
+        app.check_groups(settings)
+    else:
         own = tuple(group for group in typed.GROUPS if typed.was_typed(f"{group}.make"))
         allowed = ("training.updates", *OF_THE_MACHINE, "hydra.")
         typed.refuse_other_overrides("resume", allowed, own)
@@ -230,8 +231,8 @@ def check_trained(path: Path, checkpoint: Checkpoint) -> None:
     """
     if "optimizer" not in checkpoint.training:
         raise InputError(
-            f"resume={path}: holds a policy without the state of its training; start a new run "
-            f"from it by checkpoint={path}"
+            f"resume={path}: holds a policy without the state of its training, as it comes with "
+            f"the package or from an earlier version; start a new run from it by checkpoint={path}"
         )
 
 

@@ -21,7 +21,7 @@ from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.envs.session import is_feed
 from torchrl_pref.errors import InputError, check_positive, check_seed
-from torchrl_pref.groups import OWN, find, make
+from torchrl_pref.groups import find, make, where
 from torchrl_pref.policies.base import Policy
 from torchrl_pref.pool import Normalizer, QueryPool
 from torchrl_pref.questions.base import Question
@@ -85,7 +85,7 @@ def check_groups(settings: Settings) -> None:
     question = make("question", settings["question"])
     if n_options is not None:
         question.answers(n_options)
-        make("task", settings["task"])
+        _try_task(settings)
     taus = settings["tau"] if isinstance(settings["tau"], list) else [settings["tau"]]
     for tau in taus:
         number = None if tau == "optimal" else 1.0 if tau == "noisy" else float(tau)
@@ -93,8 +93,24 @@ def check_groups(settings: Settings) -> None:
             lapse = settings[section]["lapse"]
             model = response_model(number, question, lapse)
             make(section, settings[section], model, without=("lapse",))
-    if settings.get("policy", {}).get("name") == OWN:
+    if settings.get("policy", {}).get("name", "pretrained") != "pretrained":
         find("policy", settings["policy"])
+
+
+def _try_task(settings: Settings) -> None:
+    """Make the task, and two trajectories of it.
+
+    Raises:
+        InputError: it cannot be made, or fails.
+    """
+    task = make("task", settings["task"])
+    try:
+        make_pool(task, 1, 2, seed=0)
+    except Exception as error:
+        named = settings["task"].get("make", settings["task"]["name"])
+        raise InputError(
+            f"task={named}: its first trajectories fail ({where(error)}); mend it, or its settings"
+        ) from error
 
 
 def response_model(tau: float | None, question: Question, lapse: float) -> ResponseModel:

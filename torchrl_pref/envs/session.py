@@ -89,6 +89,7 @@ class SessionEnv(EnvBase):
         super().__init__(device=device, batch_size=torch.Size(batch_size))
         self.register_buffer("features", pool.features.to(device))
         self.human = human
+        self.n_answers = human.response_model.n_answers(pool.n_options)
         self.belief = belief
         self.objective = objective
         self._objective = make_objective(objective)
@@ -146,7 +147,8 @@ class SessionEnv(EnvBase):
         hidden, session = self._fresh()
         if set_state and tensordict is not None:
             state = TensorDict({**hidden, "session": session}, self.batch_size, device=self.device)
-            given = check_state(tensordict, state, len(self.features)).clone().to_dict()
+            given = check_state(tensordict, state, len(self.features), self.n_answers)
+            given = given.clone().to_dict()
             _overwrite(hidden, given)
             _overwrite(cast(Tree, session), given.get("session", {}))
             session["mean"] = session["samples"].mean(1)
@@ -161,8 +163,8 @@ class SessionEnv(EnvBase):
     def _fresh(self) -> tuple[Tree, SessionState]:
         """New humans who have answered nothing. The draws that strategies share come first."""
         size, (_, n_options, n_features) = self.batch_size.numel(), self.features.shape
-        rng, n_answers = self.generator, self.human.response_model.n_answers(n_options)
-        human = self.human.draw(size, self.budget, n_answers, n_features, rng).to_dict()
+        rng = self.generator
+        human = self.human.draw(size, self.budget, self.n_answers, n_features, rng).to_dict()
         session = begin(self.belief.prior(size, n_features, rng), self.budget, n_options)
         # The bits of a number of the prior: another one for each session, and no draw more.
         human["number"] = number = session["samples"][:, 0, :1].clone().view(torch.int32)

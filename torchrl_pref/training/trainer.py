@@ -171,7 +171,8 @@ class Trainer:
         restore_optimizer(self.algorithm.optimizer, state["optimizer"]["state"])
         now = self.sessions.now
         session = now.select(*self.env.state_spec.keys())
-        restore_sessions(now, state["sessions"], session, len(self.env.features))
+        sizes = len(self.env.features), self.env.n_answers
+        restore_sessions(now, state["sessions"], session, *sizes)
         restore_generator(self.env.generator, state["env_generator"])
         restore_generator(torch.default_generator, state["global_generator"])
 

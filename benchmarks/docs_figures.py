@@ -215,6 +215,7 @@ def measured(name: str, page: str, minutes: float, more: str = "") -> Part:
 
 
 SWEEP = "hydra.sweep.dir={folder}/sweep"
+TWO = "hydra/launcher=joblib hydra.launcher.n_jobs=2"
 CELLS = [f"{setup}-{tau}" for setup in ("feed", "query") for tau in ("noisy", "optimal")]
 START = "policy.start=information_gain training.learning_rate=0.01 training.updates=200"
 
@@ -228,18 +229,18 @@ PARTS: dict[str, Part] = {
     "heldout": Part(
         "docs/results.md",
         (f"python evaluate.py protocol=heldout hydra.run.dir={{folder}} -> {CSV}",),
-        12,
+        13,
         heldout,
     ),
     "paper": Part(
         "docs/paper.md",
         (
-            f"python train.py -m setup=query,feed tau=noisy,optimal experiment=paper {SWEEP} "
+            f"python train.py -m setup=query,feed tau=noisy,optimal experiment=paper {TWO} {SWEEP} "
             "-> sweep/3/tables.txt",
             "python evaluate.py checkpoint={folder}/sweep hydra.run.dir={folder}/evaluation "
             f"-> evaluation/{CSV}",
         ),
-        35,
+        20,
         paper,
     ),
     "objectives": Part(
@@ -315,11 +316,11 @@ def between(text: str, mark: str, content: str) -> str:
     Raises:
         ValueError: the page has no such marks.
     """
-    begin, end = f"<!-- begin: {mark} -->\n", f"\n<!-- end: {mark} -->"
+    begin, end = f"<!-- begin: {mark} -->\n", f"<!-- end: {mark} -->"
     found = re.compile(re.escape(begin) + ".*?" + re.escape(end), re.S)
     if not found.search(text):
         raise ValueError(f"no {begin.strip()} … {end.strip()} in the page")
-    return found.sub(lambda _: f"{begin}{content}{end}", text)
+    return found.sub(lambda _: f"{begin}{content}\n{end}", text)
 
 
 def overview(names: list[str]) -> str:

@@ -14,7 +14,7 @@ train: install
 	.venv/bin/python train.py $(ARGS)
 
 test: install
-	.venv/bin/python -m pytest
+	.venv/bin/python -m pytest -n auto
 
 lint: install
 	.venv/bin/ruff check .

@@ -23,6 +23,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 import typed
+from help_text import help_text
 from torchrl_pref import runs, sweeps
 from torchrl_pref.config.settings import open_groups
 from torchrl_pref.errors import InputError, one_line_errors
@@ -40,6 +41,9 @@ def main(job: Callable[[], Any], check: Callable[[dict[str, Any]], None]) -> Non
         check: raises an InputError for settings that the job cannot use; it is called before
             anything is made for them.
     """
+    if {"--help", "-h"} & set(sys.argv[1:]):
+        print(help_text(Path(sys.argv[0]).stem))
+        return
     # Without this Hydra prints its own several lines and exits with status 1.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     # Python puts a script's folder on the path of the script alone; a launcher's workers need it.
@@ -114,7 +118,7 @@ def allow_typed(settings: dict[str, Any]) -> None:
 
 
 def refuse_other_code(settings: dict[str, Any], new: dict[str, Any]) -> None:
-    """Refuse code of the user's own that a run was not made with.
+    """Refuse code of the user's own, or settings of it, that a run was not made with.
 
     Args:
         settings: of the run.
@@ -131,6 +135,13 @@ def refuse_other_code(settings: dict[str, Any], new: dict[str, Any]) -> None:
                     f"{group}={here}: the run was made with {group}="
                     f"{there or settings[group]['name']}; type that, or leave {group} out"
                 )
+            for key, value in new[group].items():
+                known = settings[group].get(key)
+                if typed.was_typed(f"{group}.{key}") and value != known:
+                    raise InputError(
+                        f"{group}.{key}={value}: the run was made with {group}.{key}={known}; "
+                        f"leave {group}.{key} out"
+                    )
 
 
 def check_groups(settings: dict[str, Any]) -> None:

@@ -81,15 +81,23 @@ def check(settings: dict[str, Any]) -> None:
     if settings.get("protocol") is not None:
         typed.refuse_other_overrides("protocol", PROTOCOL_KEYS)
     elif settings.get("checkpoint") is not None:
-        if "policy" in settings:
+        own = tuple(group for group in typed.GROUPS if typed.was_typed(f"{group}.make"))
+        if "policy" in settings and "policy" not in own:
             raise InputError(
                 "policy=pretrained and checkpoint=… name two policies; expected one of "
                 "them; pretrained policies are files too: checkpoint=[a.pt,b.pt]"
             )
         allowed = ("evaluation.", "pool.test", "strategy", "device", "threads", "hydra.")
-        typed.refuse_other_overrides("checkpoint", allowed)
-    check_evaluate_settings(settings)
+        typed.refuse_other_overrides("checkpoint", allowed, own)
     app.allow_typed(settings)
+    if settings.get("checkpoint") is not None:
+        settings.pop("policy", None)  # code of the user's, for whichever checkpoint names it
+    elif settings.get("policy", {}).get("name") == "own":
+        raise InputError(
+            f"policy={settings['policy'].get('make')}: a policy of yours is evaluated as it was "
+            "trained; add checkpoint=<its run folder>, or name a strategy by strategy="
+        )
+    check_evaluate_settings(settings)
     app.check_groups(settings)
     own_strategies(settings)
 

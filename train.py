@@ -24,7 +24,7 @@ from torchrl_pref.runs import CHECKPOINT
 from torchrl_pref.storage.writing import write_text
 
 if TYPE_CHECKING:
-    from torchrl_pref.build import Task
+    from torchrl_pref.build import Problem
     from torchrl_pref.checkpoints.checkpoint import Checkpoint
     from torchrl_pref.training.trainer import Trainer
 
@@ -53,8 +53,9 @@ def check(settings: dict[str, Any]) -> None:
     """
     check_train_settings(settings)
     app.allow_typed(settings)
-    app.check_groups(settings)
-    if settings["resume"] is not None:
+    if settings["resume"] is None:
+        app.check_groups(settings)
+    else:
         own = tuple(group for group in typed.GROUPS if typed.was_typed(f"{group}.make"))
         allowed = ("training.updates", *OF_THE_MACHINE, "hydra.")
         typed.refuse_other_overrides("resume", allowed, own)
@@ -230,12 +231,12 @@ def check_trained(path: Path, checkpoint: Checkpoint) -> None:
     """
     if "optimizer" not in checkpoint.training:
         raise InputError(
-            f"resume={path}: holds a policy without the state of its training; start a new run "
-            f"from it by checkpoint={path}"
+            f"resume={path}: holds a policy without the state of its training, as it comes with "
+            f"the package or from an earlier version; start a new run from it by checkpoint={path}"
         )
 
 
-def train(folder: Path, settings: dict[str, Any], task: Task, trainer: Trainer) -> float:
+def train(folder: Path, settings: dict[str, Any], task: Problem, trainer: Trainer) -> float:
     """Train, evaluate on the held-out pool, report."""
     from torchrl_pref.evaluation import comparison, reports
     from torchrl_pref.training import figure

@@ -67,28 +67,9 @@ def test_a_checkpoint_never_names_code_to_import(tmp_path: Path) -> None:
     assert "the run was made with policy=my_policy:perceptron" in other.stderr
     typed = run("train.py", *longer, "policy=my_policy:perceptron")
     assert typed.returncode == 0, typed.stderr
-
-
-@pytest.mark.parametrize(
-    ("typed", "words"),
-    [
-        ("task=my_task:Nothing", "task=my_task:Nothing: cannot be imported"),
-        ("task=nowhere:Table", "No module named 'nowhere'"),
-        ("task=my_task:torch", "task=my_task:torch: module; expected a class or a function"),
-        ("task=own", "task"),
-        ("human=my_human:Tiring human.patients=3", "unexpected keyword argument 'patients'"),
-        ("question=weak question.threshold=-1", "question.threshold=-1: expected a finite number"),
-        ("question=weak pool.options=3", "a weak question about 3 options: expected 2"),
-        ("question=weak tau=optimal", "tau=optimal with Weak"),
-        ("policy.width=3", "width"),
-    ],
-)
-def test_what_cannot_be_made_is_refused_before_there_is_a_folder(
-    typed: str, words: str, tmp_path: Path
-) -> None:
-    done = run("train.py", *typed.split(), f"hydra.run.dir={tmp_path / 'run'}")
-    assert done.returncode == 2
-    assert done.stderr.startswith("error: ")
-    assert done.stderr.count("\n") == 1
-    assert words in done.stderr
-    assert not (tmp_path / "run").exists()
+    judged = [f"checkpoint={folder}", f"hydra.run.dir={tmp_path / 'judged'}"]
+    assert "a file names code" in run("evaluate.py", *judged).stderr
+    typed = run("evaluate.py", *judged, "policy=my_policy:perceptron")
+    assert typed.returncode == 0, typed.stderr
+    alone = run("evaluate.py", "policy=my_policy:perceptron")
+    assert "add checkpoint=<its run folder>" in alone.stderr

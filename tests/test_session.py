@@ -100,7 +100,7 @@ def test_people_side_by_side_are_as_each_alone(generator: Generator) -> None:
     assert session.weights.mean.shape == (3, 3)
     assert session.score(features[:7, 0])[0].shape == (3, 7)
     session.undo()
-    with pytest.raises(InputError, match="one for each of 3 people"):
+    with pytest.raises(InputError, match="a list, one for each person"):
         session.tell(0)
 
 
@@ -111,6 +111,38 @@ def test_no_answer_teaches_nothing(generator: Generator) -> None:
     session.tell(None)
     assert session.n_answered == 1
     assert torch.equal(session.samples, before)
+
+
+def test_what_a_person_would_not_answer_is_not_asked_again(generator: Generator) -> None:
+    session = Session(torch.randn(50, 2, 3, generator=generator), MODEL, budget=6)
+    asked = []
+    for _ in range(6):
+        asked.append(int(session.ask().query))
+        session.tell(None)
+    assert len(set(asked)) == 6
+
+
+def test_parts_that_contradict_each_other_are_refused(generator: Generator) -> None:
+    features = torch.randn(50, 2, 3, generator=generator)
+    for given, words in (
+        ({"belief": Belief(Boltzmann(1.0))}, "expected the same"),
+        ({"belief": 3}, "belief of type int"),
+        ({"normalizer": 3}, "normalizer of type int"),
+        ({"strategy": lambda env: 3}, "what strategy makes"),
+        ({"strategy": "greedy"}, "strategy='greedy': expected one of random"),
+        ({"budget": 51}, "candidates"),
+        ({"people": 0}, "people=0"),
+    ):
+        with pytest.raises(InputError, match=words):
+            Session(features, MODEL, **given)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="features"):
+        Session(features, MODEL).score(torch.full((2, 3), torch.nan))
+
+
+def test_models_tell_themselves_apart() -> None:
+    assert repr(Boltzmann(2.0)) == "Boltzmann(tau=2)"
+    assert repr(Boltzmann(2.0000001)) != repr(Boltzmann(2.0))
+    assert repr(Optimal(0.5)) != repr(Optimal())
 
 
 def test_other_kinds_of_question(generator: Generator) -> None:
@@ -147,7 +179,11 @@ def test_what_is_no_answer_changes_nothing(answer: Any, generator: Generator) ->
         {"seed": "0"},
         {"budget": 1},
         {"pool": "0" * 64},
-        {"samples": 50},
+        {"belief": "Belief(n_samples=50, n_moves=None)"},
+        {"strategy": "random"},
+        {"answers": [[0], [10**30]]},
+        {"answers": [[0, 1], [0]]},
+        {"repeats": 0},
         {"response_model": "Boltzmann(tau=4)"},
         {"asked": [50]},
     ],

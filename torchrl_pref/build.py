@@ -21,7 +21,7 @@ from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.envs.session import is_feed
 from torchrl_pref.errors import InputError, check_positive, check_seed
-from torchrl_pref.groups import OWN, find, make
+from torchrl_pref.groups import find, make, where
 from torchrl_pref.policies.base import Policy
 from torchrl_pref.pool import Normalizer, QueryPool
 from torchrl_pref.questions.base import Question
@@ -38,7 +38,7 @@ NOISY_ACCURACY = 0.9
 
 
 @dataclass(frozen=True)
-class Task:
+class Problem:
     """What a policy is trained and judged on.
 
     Attributes:
@@ -85,7 +85,7 @@ def check_groups(settings: Settings) -> None:
     question = make("question", settings["question"])
     if n_options is not None:
         question.answers(n_options)
-        make("task", settings["task"])
+        _try_task(settings)
     taus = settings["tau"] if isinstance(settings["tau"], list) else [settings["tau"]]
     for tau in taus:
         number = None if tau == "optimal" else 1.0 if tau == "noisy" else float(tau)
@@ -93,8 +93,24 @@ def check_groups(settings: Settings) -> None:
             lapse = settings[section]["lapse"]
             model = response_model(number, question, lapse)
             make(section, settings[section], model, without=("lapse",))
-    if settings.get("policy", {}).get("name") == OWN:
+    if settings.get("policy", {}).get("name", "pretrained") != "pretrained":
         find("policy", settings["policy"])
+
+
+def _try_task(settings: Settings) -> None:
+    """Make the task, and two trajectories of it.
+
+    Raises:
+        InputError: it cannot be made, or fails.
+    """
+    task = make("task", settings["task"])
+    try:
+        make_pool(task, 1, 2, seed=0)
+    except Exception as error:
+        named = settings["task"].get("make", settings["task"]["name"])
+        raise InputError(
+            f"task={named}: its first trajectories fail ({where(error)}); mend it, or its settings"
+        ) from error
 
 
 def response_model(tau: float | None, question: Question, lapse: float) -> ResponseModel:
@@ -150,7 +166,7 @@ def draw_pool(settings: Settings, seed: int) -> QueryPool:
 
 def make_task(
     train: QueryPool, test: QueryPool, tau: Any, settings: Settings | None = None
-) -> Task:
+) -> Problem:
     """Fit the normaliser on the training pool, normalise both, solve for tau.
 
     Args:
@@ -182,16 +198,16 @@ def make_task(
     else:
         solved = float(tau)
     if settings is None:
-        return Task(train, test, normalizer, solved)
+        return Problem(train, test, normalizer, solved)
     question = make("question", settings["question"])
     question.answers(train.n_options)  # or it is refused here
     lapses = (settings[section]["lapse"] for section in ("human", "belief"))
-    task = Task(train, test, normalizer, solved, question, *lapses)
+    task = Problem(train, test, normalizer, solved, question, *lapses)
     _ = task.human_model, task.response_model
     return task
 
 
-def reload_task(checkpoint: Checkpoint, train: Path, test: Path) -> Task:
+def reload_task(checkpoint: Checkpoint, train: Path, test: Path) -> Problem:
     """The task of a run from its pool files; made again from its settings where they are gone.
 
     Raises:
@@ -224,7 +240,7 @@ def reload_task(checkpoint: Checkpoint, train: Path, test: Path) -> Task:
 
 def make_query_env(
     settings: Settings,
-    task: Task,
+    task: Problem,
     pool: QueryPool,
     sessions: int,
     seed: int,
@@ -237,7 +253,7 @@ def make_query_env(
 
 
 def make_feed_env(
-    settings: Settings, task: Task, pool: QueryPool, sessions: int, seed: int
+    settings: Settings, task: Problem, pool: QueryPool, sessions: int, seed: int
 ) -> FeedEnv:
     """The feed environment on a normalised pool, by the sections ``setup`` and ``belief``."""
     setup = settings["setup"]
@@ -247,7 +263,7 @@ def make_feed_env(
 
 
 def make_training_env(
-    settings: Settings, task: Task, pool: QueryPool, sessions: int, seed: int
+    settings: Settings, task: Problem, pool: QueryPool, sessions: int, seed: int
 ) -> QueryEnv | FeedEnv:
     """The environment in which a policy of these settings learns, on a normalised pool."""
     if settings["setup"]["name"] == "feed":
@@ -257,7 +273,9 @@ def make_training_env(
     return make_query_env(settings, task, pool, sessions, seed, candidates)
 
 
-def _session_arguments(settings: Settings, task: Task, sessions: int, seed: int) -> dict[str, Any]:
+def _session_arguments(
+    settings: Settings, task: Problem, sessions: int, seed: int
+) -> dict[str, Any]:
     """What both environments are made with."""
     belief = settings["belief"]
     return {

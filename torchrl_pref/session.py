@@ -18,11 +18,19 @@ from torchrl_pref.beliefs.base import BeliefBase
 from torchrl_pref.beliefs.sampled import Belief
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.envs.transition import REFUSED, begin, tell
-from torchrl_pref.errors import InputError, check_choice, check_count, check_seed, check_type
+from torchrl_pref.errors import (
+    InputError,
+    check_choice,
+    check_count,
+    check_flag,
+    check_seed,
+    check_type,
+)
 from torchrl_pref.humans.simulated import SimulatedHuman
 from torchrl_pref.pool import Normalizer, QueryPool
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.strategies import STRATEGIES, MakeStrategy
+from torchrl_pref.tensors import check_finite, check_plain
 
 FORMAT = 1
 """Of what :meth:`Session.to_dict` makes."""
@@ -68,12 +76,14 @@ class Session:
 
     Args:
         pool: the queries, normalised; or their features (N K D).
-        response_model: how the person is thought to answer; also says what can be answered.
+        response_model: how the person is thought to answer, and what can be answered. A belief that
+            is given has the same.
         strategy: a name of ``strategies.STRATEGIES``; ``policy``, the trained one that comes with
             the package; or a function from a ``QueryEnv`` to a module that writes ``action``.
         belief: how answers become a belief; by default samples.
         budget: H, questions that are planned, and the most that can be asked.
         people: B; None is one person, and nothing has a leading B.
+        repeats: whether a question may come again; one that a person would not answer, too.
         normalizer: what the pool was normalised by, for :meth:`score` to apply to raw features.
         seed: fixes all luck.
 
@@ -91,16 +101,29 @@ class Session:
         people: int | None = None,
         normalizer: Normalizer | None = None,
         seed: int = 0,
+        repeats: bool = False,
     ) -> None:
         check_type("response_model", response_model, ResponseModel, "Boltzmann(2.0)")
+        belief = Belief(response_model) if belief is None else belief
+        check_type("belief", belief, BeliefBase, "Belief(Boltzmann(2.0))")
+        if repr(belief.response_model) != repr(response_model):
+            raise InputError(
+                f"response_model={response_model!r} and a belief with {belief.response_model!r}: "
+                "expected the same; make the belief with it"
+            )
+        if normalizer is not None:
+            check_type("normalizer", normalizer, Normalizer, "Normalizer.fit(features)")
         self.pool = QueryPool(pool) if isinstance(pool, Tensor) else pool
         self.budget, self.seed = check_count("budget", budget, 1), check_seed("seed", seed)
         self.people = None if people is None else check_count("people", people, 1)
         self.normalizer = normalizer
-        belief = Belief(response_model) if belief is None else belief
-        human = SimulatedHuman(belief.response_model)  # nobody whom it asks
+        self.strategy = strategy if isinstance(strategy, str) else "own"
+        human = SimulatedHuman(response_model)  # nobody whom it asks
         size = (1 if people is None else people,)
-        self._env = QueryEnv(self.pool, human, belief, budget, batch_size=size, seed=seed)
+        check_flag("repeats", repeats)
+        self._env = QueryEnv(
+            self.pool, human, belief, budget, repeats=repeats, batch_size=size, seed=seed
+        )
         self._strategy = _made(strategy, self._env)
         samples = belief.prior(size[0], self.pool.n_features, Generator().manual_seed(self.seed))
         self._states = [begin(samples, budget, self.pool.n_options)]
@@ -148,19 +171,9 @@ class Session:
         if self._asked is None:
             raise InputError("an answer to no question: expected ask() before tell()")
         given = [answer] if self.people is None else answer
-        if not isinstance(given, Sequence) or len(given) != len(self._asked):
-            raise InputError(
-                f"answer={answer!r}: expected one for each of {len(self._asked)} people"
-            )
-        last = self._env.belief.response_model.n_answers(self.pool.n_options) - 1
-        for one in given:
-            if one is not None and (type(one) is not int or not 0 <= one <= last):
-                raise InputError(
-                    f"answer={one!r}: expected a whole number from 0 to {last}, or None where the "
-                    "person would not say"
-                )
-        answers = torch.tensor([REFUSED if one is None else one for one in given])
-        self._let_in(self._asked, answers)
+        if not isinstance(given, Sequence):
+            raise InputError(f"answer={answer!r}: expected a list, one for each person")
+        self._let_in(self._asked, self._said(given))
 
     def undo(self) -> None:
         """Take the last answer back; its question is asked again.
@@ -194,7 +207,11 @@ class Session:
 
         Returns:
             (B n) and (B n), mean and standard deviation over the samples.
+
+        Raises:
+            InputError: the features are not (n D) finite numbers.
         """
+        check_finite("features", check_plain("features", features))
         if self.normalizer is not None:
             features = self.normalizer(features)
         if features.ndim != 2 or features.shape[-1] != self.pool.n_features:
@@ -210,7 +227,9 @@ class Session:
             "format": FORMAT,
             "pool": self.pool.digest,
             "response_model": repr(self._env.belief.response_model),
-            "samples": self._env.belief.n_samples,
+            "belief": repr(self._env.belief),
+            "strategy": self.strategy,
+            "repeats": self._env.repeats,
             "budget": self.budget,
             "people": self.people,
             "seed": self.seed,
@@ -239,17 +258,20 @@ class Session:
             InputError: the content is spoiled, or was made with another pool or belief.
         """
         check_content(content)
-        budget, people, seed = (content[key] for key in ("budget", "people", "seed"))
-        session = cls(pool, response_model, strategy, belief, budget, people, normalizer, seed)
+        keys = ("budget", "people", "seed", "repeats")
+        budget, people, seed, repeats = (content[key] for key in keys)
+        given = strategy, belief, budget, people, normalizer, seed, repeats
+        session = cls(pool, response_model, *given)
         made_with = session.to_dict()
-        for key in ("pool", "response_model", "samples"):
+        for key in ("pool", "response_model", "belief", "strategy"):
             if content[key] != made_with[key]:
                 raise InputError(
                     f"{key}: the session was made with {content[key]!s:.80}, and this is "
                     f"{made_with[key]!s:.80}; expected the same"
                 )
         for queries, answers in zip(content["queries"], content["answers"], strict=True):
-            session._let_in(session._index_of(queries), torch.tensor(answers))
+            said = session._said([None if answer == REFUSED else answer for answer in answers])
+            session._let_in(session._index_of(queries), said)
         if content["asked"] is not None:
             session._asked = session._index_of(content["asked"])
         return session
@@ -258,6 +280,23 @@ class Session:
     def _luck(self) -> int:
         """The seed of the present turn."""
         return self.seed * PRIME + self.n_answered
+
+    def _said(self, answers: Sequence[Any]) -> Tensor:
+        """(B), answers as the belief is told them.
+
+        Raises:
+            InputError: there is no such answer, or there are not B.
+        """
+        size, last = self._env.batch_size.numel(), self._env.n_answers - 1
+        if len(answers) != size:
+            raise InputError(f"answers {answers!s:.60}: expected one for each of {size} people")
+        for one in answers:
+            if one is not None and (type(one) is not int or not 0 <= one <= last):
+                raise InputError(
+                    f"answer={one!s:.40}: expected a whole number from 0 to {last}, or None where "
+                    "the person would not say"
+                )
+        return torch.tensor([REFUSED if one is None else one for one in answers])
 
     def _let_in(self, index: Tensor, answers: Tensor) -> None:
         """Add answers (B) to pool queries (B) to the belief."""
@@ -298,7 +337,9 @@ def _made(strategy: str | MakeStrategy, env: QueryEnv) -> TensorDictModuleBase:
             f"strategy of type {type(strategy).__name__}: expected a function from an environment "
             "to a module that writes action, such as lambda env: Greedy(env.belief.response_model)"
         )
-    return strategy(env)
+    made = strategy(env)
+    check_type("what strategy makes of an environment", made, TensorDictModuleBase, "Greedy(…)")
+    return made
 
 
 def check_content(content: Any) -> None:
@@ -318,7 +359,9 @@ def check_content(content: Any) -> None:
         "format": lambda value: value == FORMAT,
         "pool": lambda value: isinstance(value, str),
         "response_model": lambda value: isinstance(value, str),
-        "samples": lambda value: type(value) is int,
+        "belief": lambda value: isinstance(value, str),
+        "strategy": lambda value: isinstance(value, str),
+        "repeats": lambda value: type(value) is bool,
         "budget": lambda value: type(value) is int,
         "people": lambda value: value is None or type(value) is int,
         "seed": lambda value: type(value) is int,

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from tensordict import TensorDictBase
@@ -17,11 +18,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Generator, Tensor
 from torchrl.envs import EnvBase
 
+from torchrl_pref.acquisition import ACQUISITIONS
 from torchrl_pref.acquisition.functions import (
     Acquisition,
-    alignment_gain,
     information_gain,
-    volume_removal,
 )
 from torchrl_pref.acquisition.scoring import moments_among, predict_answers, score_queries, together
 from torchrl_pref.beliefs.per_belief import PerBelief
@@ -275,14 +275,17 @@ def asks_over_offers(n_asked: Tensor, n_offered: Tensor, budget: int, n_offers: 
     return ((budget - n_asked) / (n_offers - n_offered).clamp(min=1)).clamp(max=1)
 
 
+def _greedy(env: EnvBase, acquisition: Acquisition) -> TensorDictModuleBase:
+    """What asks greedily in an environment."""
+    return Greedy(env.belief.response_model, acquisition)
+
+
 MakeStrategy = Callable[[EnvBase], TensorDictModuleBase]
 """From an environment to what asks in it."""
 
 STRATEGIES: dict[str, MakeStrategy] = {
     "random": lambda env: RandomQuery(),
-    "information_gain": lambda env: Greedy(env.belief.response_model, information_gain),
-    "alignment_gain": lambda env: Greedy(env.belief.response_model, alignment_gain),
-    "volume_removal": lambda env: Greedy(env.belief.response_model, volume_removal),
+    **{name: partial(_greedy, acquisition=each) for name, each in ACQUISITIONS.items()},
     "lookahead": lambda env: Lookahead(env.belief.response_model),
 }
-"""Strategies that choose from candidates, by name."""
+"""Strategies that choose from candidates, by name: greedy ones by that of what they maximise."""

@@ -7,6 +7,7 @@ import random
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -17,10 +18,13 @@ import torchrl_pref
 from benchmarks.bad_settings import FAULTS, every_command, run_forked
 from torchrl_pref.beliefs import sampled as belief
 from torchrl_pref.beliefs import slice as sampler
-from torchrl_pref.config import memory, settings
+from torchrl_pref.checkpoints import contents
+from torchrl_pref.config import checks, memory, settings
 from torchrl_pref.envs import objectives
 from torchrl_pref.errors import InputError, one_line
 from torchrl_pref.policies import attention
+from torchrl_pref.training.algorithms import ALGORITHMS
+from torchrl_pref.training.loggers import LOGGERS
 
 ROOT = Path(__file__).parents[2]
 
@@ -41,10 +45,11 @@ def test_a_random_sample_of_bad_settings_is_refused_in_one_line() -> None:
     assert sum(result.outcome == "refused" for result in results) > 40
 
 
+@pytest.mark.parametrize("algorithm", ["a2c", "ppo"])
 @pytest.mark.parametrize("setup", ["query", "feed"])
 @pytest.mark.parametrize("policy", ["scorer", "attention", "paper"])
-def test_every_default_of_a_training_is_legal(setup: str, policy: str) -> None:
-    typed = composed("train", f"setup={setup}", f"policy={policy}")
+def test_every_default_of_a_training_is_legal(setup: str, policy: str, algorithm: str) -> None:
+    typed = composed("train", f"setup={setup}", f"policy={policy}", f"algorithm={algorithm}")
     settings.check_train_settings(typed)
     run = {key: value for key, value in typed.items() if key not in ("resume", "checkpoint")}
     settings.check_run({**run, "overrides": []})
@@ -66,6 +71,46 @@ def test_words_are_those_of_the_library() -> None:
     assert set(settings.OBJECTIVES) == set(objectives.OBJECTIVES)
     for tokens in attention.TOKENS:
         settings.POLICIES["attention"]["policy.tokens"]("policy.tokens", tokens)
+    assert set(settings.ALGORITHMS) == set(ALGORITHMS) == set(contents.ALGORITHMS)
+    assert set(checks.LOGGERS) == {"csv", *LOGGERS}
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ("csv", r"logger='csv': expected a list, such as logger=\[csv,tensorboard\]"),
+        (None, "logger=None: expected a list"),
+        (["paper"], "logger='paper': expected one of csv, tensorboard, wandb, mlflow"),
+        ([["csv"]], "expected one of csv"),
+        (["csv", "csv"], "names the same twice"),
+        (
+            ["csv", "wandb"],
+            r"wandb is not installed; install it by .*'\.\[wandb\]', or leave wandb",
+        ),
+        (["mlflow"], r"mlflow is not installed; install it by .*'\.\[mlflow\]', or leave mlflow"),
+    ],
+)
+def test_bad_loggers_are_refused(value: Any, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(checks, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match=message):
+        settings.check_train_settings({**composed("train"), "logger": value})
+
+
+def test_loggers_may_be_none_or_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(checks, "find_spec", lambda name: SimpleNamespace(origin="a file"))
+    for value in ([], ["csv"], ["mlflow", "wandb", "tensorboard", "csv"]):
+        settings.check_train_settings({**composed("train"), "logger": value})
+
+
+def test_a_folder_named_wandb_is_no_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """wandb leaves one where it ran."""
+    (tmp_path / "wandb").mkdir()
+    monkeypatch.setattr(sys, "path", [str(tmp_path)])
+    monkeypatch.delitem(sys.modules, "wandb", raising=False)
+    with pytest.raises(InputError, match="wandb is not installed"):
+        checks.check_loggers("logger", ["wandb"])
 
 
 @pytest.mark.parametrize(
@@ -103,7 +148,9 @@ def test_a_pool_of_ones_own_counts_as_large_as_it_is() -> None:
         memory.check_memory(typed, 10**10, 2, 4)
 
 
-@pytest.mark.parametrize("key", ["tau", "seed", "training.gamma", "setup", "policy", "belief"])
+@pytest.mark.parametrize(
+    "key", ["tau", "seed", "training.gamma", "logger", "setup", "policy", "algorithm", "belief"]
+)
 def test_a_missing_key_is_named(key: str) -> None:
     typed = copy.deepcopy(composed("train"))
     *sections, name = key.split(".")

@@ -17,7 +17,7 @@ from torchrl_pref.envs.transition import (
     NOT_OF_THE_POOL,
     OPEN,
     REFUSED,
-    Session,
+    SessionState,
     begin,
     tell,
 )
@@ -28,11 +28,13 @@ from torchrl_pref.questions.responses import Optimal
 BELIEF = Belief(RESPONSE_MODELS[0], 20, 2)
 
 
-def fresh(belief: Belief = BELIEF, size: int = 3, budget: int = 4) -> Session:
+def fresh(belief: Belief = BELIEF, size: int = 3, budget: int = 4) -> SessionState:
     return begin(belief.prior(size, 4, Generator().manual_seed(1)), budget, 2)
 
 
-def told(session: Session, answers: list[int], seed: int = 2, belief: Belief = BELIEF) -> Session:
+def told(
+    session: SessionState, answers: list[int], seed: int = 2, belief: Belief = BELIEF
+) -> SessionState:
     """After an answer each to a made-up query."""
     options = torch.randn(len(answers), 2, 4, generator=Generator().manual_seed(3))
     index = torch.full((len(answers),), NOT_OF_THE_POOL)
@@ -117,7 +119,7 @@ def test_a_replayed_log_ends_where_the_environment_did(pool: QueryPool) -> None:
     session = env.reset()
     generator, belief = Generator(), env.belief
     generator.set_state(env.generator.get_state())
-    replayed: Session = begin(session["session", "samples"], 5, 2)
+    replayed: SessionState = begin(session["session", "samples"], 5, 2)
     for action in (7, 2, 9):
         session = env.step_mdp(env.step(session.set("action", torch.tensor([action]))))
     history = session["session", "history"]

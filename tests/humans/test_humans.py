@@ -1,17 +1,24 @@
 """What everybody who answers keeps to: the package's humans, and one written outside of it."""
 
 from collections.abc import Callable
+from typing import Any
 
 import my_human
 import pytest
 import torch
-from torch import Generator
+from tensordict import TensorDict
+from torch import Generator, Tensor
 
+from torchrl_pref.beliefs.sampled import Belief
+from torchrl_pref.envs.query import QueryEnv
+from torchrl_pref.evaluation.run import draw_humans, evaluate
 from torchrl_pref.humans import HUMANS
 from torchrl_pref.humans.base import HumanBase
+from torchrl_pref.pool import QueryPool
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.questions.responses import Boltzmann, Optimal
 from torchrl_pref.questions.weak import Weak
+from torchrl_pref.strategies import Greedy
 
 MAKE = [*HUMANS.values(), my_human.Tiring]
 MODELS = [Boltzmann(4.0), Optimal(), Boltzmann(4.0, Weak(0.3), lapse=0.1)]
@@ -56,3 +63,25 @@ def test_who_tires_errs_more_and_more(generator: Generator) -> None:
         for t in (0, 5, 19)
     ]
     assert right == pytest.approx([1.0, 0.75, 1 - 19 / 24 / 2], abs=0.04)
+
+
+class Plain(HumanBase):
+    """No more than what is promised of all."""
+
+    response_model = Optimal()
+
+    def draw(
+        self, n_sessions: int, budget: int, n_answers: int, n_features: int, generator: Generator
+    ) -> TensorDict:
+        omega = torch.randn(n_sessions, n_features, generator=generator)
+        return TensorDict({"omega": omega / omega.norm(dim=-1, keepdim=True)}, [n_sessions])
+
+    def respond(self, queries: Tensor, human: Any, turn: Tensor) -> Tensor:
+        return (queries @ human["omega"].unsqueeze(-1)).squeeze(-1).argmax(-1)
+
+
+def test_omega_is_all_that_an_environment_needs(pool: QueryPool) -> None:
+    """Also where humans are handed on, as each evaluation does."""
+    env = QueryEnv(pool, Plain(), Belief(Optimal(), 20), 4, batch_size=(5,), seed=0)
+    result = evaluate(env, Greedy(Optimal()), draw_humans(env))
+    assert result.alignment.shape == (5, 5)

@@ -18,7 +18,7 @@ from torchrl_pref.errors import InputError
 from torchrl_pref.humans.simulated import SimulatedHuman
 from torchrl_pref.pool import QueryPool
 from torchrl_pref.questions import QUESTIONS
-from torchrl_pref.questions.base import Question
+from torchrl_pref.questions.base import Answers, Question
 from torchrl_pref.questions.choice import Choice
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.questions.responses import Boltzmann, Optimal
@@ -113,7 +113,7 @@ def test_the_posterior_is_that_of_the_probabilities(
     )
     mean = weights @ points
     covariance = (points * weights[:, None]).T @ points - torch.outer(mean, mean)
-    sessions, belief = 400, Belief(model)
+    sessions, belief = 100 if in_tensors else 400, Belief(model)
     samples, ess = belief.prior(sessions, 3, generator), torch.full((sessions,), 100.0)
     for h in range(1, len(queries) + 1):
         evidence = model.evidence(queries[:h], answers[:h]).expand(sessions, h)
@@ -212,3 +212,32 @@ def test_the_kinds_are_values() -> None:
     assert repr(Boltzmann(2.0, Weak(0.5), 0.1)) == (
         "Boltzmann(tau=2, Weak(threshold=0.5), lapse=0.1)"
     )
+
+
+class Shouting(Question):
+    """Somebody's own, in which the second answer counts too much."""
+
+    def __init__(self, levels: object = 1.0) -> None:
+        self.levels = levels
+
+    def answers(self, n_options: int) -> Answers:
+        return Choice().answers(n_options)._replace(log_weights=torch.ones(n_options))
+
+
+def test_tables_of_ones_own_are_looked_at(generator: Generator) -> None:
+    """Each has shapes that fit and probabilities that sum to one."""
+    options = torch.randn(3, 2, 4, generator=generator)
+    answers = torch.zeros(3, dtype=torch.int64)
+    with pytest.raises(InputError, match=r"sum to 2.72; expected 1 whatever the returns are"):
+        Boltzmann(1.0, Shouting()).evidence(options, answers)
+    with pytest.raises(InputError, match="make a list a tuple"):
+        Boltzmann(1.0, Shouting([1.0, 2.0])).evidence(options, answers)
+
+
+def test_answers_of_any_whole_numbers(generator: Generator) -> None:
+    options = torch.randn(3, 2, 4, generator=generator)
+    model = Boltzmann(1.0, Weak(), lapse=0.1)
+    expected = model.evidence(options, torch.tensor([1, 1, 2]))
+    found = model.evidence(options, torch.tensor([1, 1, 2], dtype=torch.uint8))
+    assert torch.equal(found.floor, expected.floor)
+    assert torch.equal(found.rows, expected.rows)

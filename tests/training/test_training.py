@@ -164,8 +164,10 @@ def test_explained_variance_is_the_critics_share_of_the_returns() -> None:
     assert shares == pytest.approx([1, 0, 0.75, -1])
 
 
-def test_warm_up_spares_the_actor_and_the_average_follows() -> None:
-    trainer, _ = trainer_of(settings_of(warm_up=2, average=0.9, learning_rate=0.01))
+@pytest.mark.parametrize("algorithm", [{"name": "a2c"}, PPO], ids=["a2c", "ppo"])
+def test_warm_up_spares_the_actor_and_the_average_follows(algorithm: dict[str, Any]) -> None:
+    settings = settings_of(warm_up=2, average=0.9, learning_rate=0.01)
+    trainer, _ = trainer_of({**settings, "algorithm": algorithm})
     weights = trainer.policy.weights
 
     def part(name: str) -> torch.Tensor:

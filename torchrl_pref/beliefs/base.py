@@ -36,6 +36,10 @@ class BeliefBase(ABC):
     response_model: ResponseModel
     n_samples: int
 
+    def __repr__(self) -> str:
+        numbers = (f"{k}={v}" for k, v in vars(self).items() if k != "response_model")
+        return f"{type(self).__name__}({', '.join(numbers)})"
+
     @abstractmethod
     def prior(self, n_sessions: int, n_features: int, generator: Generator) -> Tensor:
         """What is believed before the first answer, (S M D)."""

@@ -277,7 +277,7 @@ class Belief(BeliefBase):
         few = kish_share(self._log_weights(gaps, floor, result, log_now)) < MIN_SHARE
         if few.any():
             gaps, floor, log_now = gaps[few], floor[few], log_now[few]
-            # At this slack every sample agrees, so the weights differ by a factor of at most K.
+            # At this slack every sample agrees, so no factor of the answer tells them far apart.
             start = torch.minimum(slack[few], (-gaps).amax((1, 2, 3)).clamp(min=0))
             result[few] = _furthest(
                 start,

@@ -162,7 +162,8 @@ def _check_types(
         words = " or ".join("null" if kind is NONE[0] else kind.__name__ for kind in types)
         _expect(type(section.get(key, ...)) in types, f"{name}.{key}", words)
     for key, value in section.items():
-        plain = type(value) in NUMBER + TEXT + FLAG + NONE or key in others
+        members = value if type(value) is list else [value]
+        plain = all(type(one) in NUMBER + TEXT + FLAG + NONE for one in members) or key in others
         _expect(type(key) is str and plain, f"{name}.{key!s:.60}", "a plain value")
 
 

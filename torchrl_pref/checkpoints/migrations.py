@@ -20,6 +20,10 @@ ADDED_CURVES = (
 """Measured of each update since format 5."""
 
 
+STATE = ("weights", "optimizer", "sessions", "env_generator", "global_generator")
+"""What a training goes on from."""
+
+
 def migrate(settings: Any) -> None:
     """Add the keys that settings of earlier versions lack, with what these versions did.
 
@@ -54,6 +58,10 @@ def migrate_training(training: Any) -> None:
         return
     for name in ADDED_CURVES:
         history.setdefault(name, [math.nan] * len(rewards))
+    # Sessions of before format 5 cannot go on: their history does not hold the options.
+    if isinstance(training.get("sessions"), dict) and "session" not in training["sessions"]:
+        for name in STATE:
+            training.pop(name, None)
     # Policies of version 0.1.0 were saved without these.
     training.setdefault("update", len(rewards))
     training.setdefault("held_out", {})

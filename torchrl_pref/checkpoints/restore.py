@@ -65,7 +65,11 @@ def restore_optimizer(optimizer: torch.optim.Optimizer, steps: Mapping[Any, Any]
 
 
 def restore_sessions(
-    carrier: TensorDictBase, sessions: dict[str, Any], state: TensorDictBase, n_queries: int
+    carrier: TensorDictBase,
+    sessions: dict[str, Any],
+    state: TensorDictBase,
+    n_queries: int,
+    n_answers: int,
 ) -> None:
     """Put saved sessions (B) into the tensordict that a collector goes on from.
 
@@ -74,6 +78,7 @@ def restore_sessions(
         sessions: as saved.
         state: the part of the carrier that is the environment's state.
         n_queries: N, of the environment's pool.
+        n_answers: R, of its question.
 
     Raises:
         InputError: they are of other sizes, or impossible.
@@ -90,7 +95,7 @@ def restore_sessions(
         known[key] = value
     saved = TensorDict(known, carrier.batch_size)
     try:
-        check_state(saved, state, n_queries)
+        check_state(saved, state, n_queries, n_answers)
     except InputError as error:
         raise InputError(f"{_spoiled('sessions')} ({error})") from None
     carrier.update(saved.to(carrier.device))

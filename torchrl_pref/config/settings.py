@@ -246,7 +246,7 @@ def open_groups(settings: Settings) -> list[str]:
     return [
         group
         for group, name in chosen.items()
-        if name == "own" or (group in OTHERS and isinstance(name, str) and name not in known[group])
+        if name == "own" or (isinstance(name, str) and name not in known[group])
     ]
 
 
@@ -291,7 +291,7 @@ def _check_together(settings: Settings) -> None:
                 f"setup.repeats=false with {shown} candidates and setup.budget={budget}: expected "
                 "at least as many candidates as asks; raise one or lower the other"
             )
-    if settings["objective"] == "entropy" and belief["samples"] < 4:
+    if settings["objective"] == "entropy" and belief.get("samples", 4) < 4:
         raise InputError(
             f"objective=entropy with belief.samples={belief['samples']}: expected at least 4, as "
             "the entropy is told by the third nearest sample; raise belief.samples"

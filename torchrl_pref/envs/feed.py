@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchrl_pref.beliefs.base import BeliefBase
 from torchrl_pref.envs.session import SessionEnv
-from torchrl_pref.envs.transition import Session, Tree
+from torchrl_pref.envs.transition import SessionState, Tree
 from torchrl_pref.errors import check_choice, check_count
 from torchrl_pref.humans.base import HumanBase
 from torchrl_pref.pool import QueryPool
@@ -77,16 +77,16 @@ class FeedEnv(SessionEnv):
         offers = torch.randint(n_queries, shape, generator=self.generator, device=self.device)
         return {"offers": offers}
 
-    def _counted(self, session: Session, number: Tensor) -> Session:
+    def _counted(self, session: SessionState, number: Tensor) -> SessionState:
         n_offered = torch.zeros_like(session["n_asked"])
         return {**super()._counted(session, number), "n_offered": n_offered}
 
-    def _offered(self, session: Session, hidden: Tree) -> Tensor:
+    def _offered(self, session: SessionState, hidden: Tree) -> Tensor:
         """(B), pool index of the query on offer; after the last offer, the last one."""
         place = session["n_offered" if self.on_skip == "new" else "n_asked"]
         return hidden["offers"].gather(-1, place.clamp(max=self.n_offers - 1)).squeeze(-1)
 
-    def _shown(self, session: Session, hidden: Tree) -> dict[str, Tensor]:
+    def _shown(self, session: SessionState, hidden: Tree) -> dict[str, Tensor]:
         shown, n_offered = super()._shown(session, hidden), session["n_offered"]
         offers_left = 1 - n_offered / self.n_offers
         shown["remaining"] = torch.cat([shown["remaining"], offers_left], -1)

@@ -19,7 +19,7 @@ from torch.nn import functional as F
 
 from torchrl_pref.acquisition.functions import alignment_gain, information_gain
 from torchrl_pref.acquisition.scoring import predict_answers, score_queries
-from torchrl_pref.envs.transition import Session
+from torchrl_pref.envs.transition import SessionState
 from torchrl_pref.errors import check_choice
 from torchrl_pref.questions.response_model import ResponseModel
 
@@ -44,20 +44,20 @@ class Objective(ABC):
     """
 
     @abstractmethod
-    def potential(self, session: Session, human: Mapping[str, Any]) -> Tensor:
+    def potential(self, session: SessionState, human: Mapping[str, Any]) -> Tensor:
         """What there is of it in a session, (B 1)."""
 
     @abstractmethod
     def forecast(
         self,
-        session: Session,
+        session: SessionState,
         human: Mapping[str, Any],
         queries: Tensor,
         response_model: ResponseModel,
     ) -> Tensor:
         """What asking each of the queries (B C K D) is expected to add, (B C)."""
 
-    def gained(self, before: Session, after: Session, human: Mapping[str, Any]) -> Tensor:
+    def gained(self, before: SessionState, after: SessionState, human: Mapping[str, Any]) -> Tensor:
         """What there is more of it after than before, (B 1)."""
         return self.potential(after, human) - self.potential(before, human)
 
@@ -65,13 +65,13 @@ class Objective(ABC):
 class InformationGain(Objective):
     """The paper's: the sum of the information gains of the asked queries, in bits (section 3.3)."""
 
-    def potential(self, session: Session, human: Mapping[str, Any]) -> Tensor:
+    def potential(self, session: SessionState, human: Mapping[str, Any]) -> Tensor:
         """See :meth:`Objective.potential`."""
         return session["information"]
 
     def forecast(
         self,
-        session: Session,
+        session: SessionState,
         human: Mapping[str, Any],
         queries: Tensor,
         response_model: ResponseModel,
@@ -87,13 +87,13 @@ class Alignment(Objective):
     its expectation without the noise of the one hidden ω.
     """
 
-    def potential(self, session: Session, human: Mapping[str, Any]) -> Tensor:
+    def potential(self, session: SessionState, human: Mapping[str, Any]) -> Tensor:
         """See :meth:`Objective.potential`."""
         return session["mean"].square().sum(-1, keepdim=True)
 
     def forecast(
         self,
-        session: Session,
+        session: SessionState,
         human: Mapping[str, Any],
         queries: Tensor,
         response_model: ResponseModel,
@@ -105,13 +105,13 @@ class Alignment(Objective):
 class TrueAlignment(Objective):
     """The paper's alignment with the simulated human's own ω, which only a simulator knows."""
 
-    def potential(self, session: Session, human: Mapping[str, Any]) -> Tensor:
+    def potential(self, session: SessionState, human: Mapping[str, Any]) -> Tensor:
         """See :meth:`Objective.potential`."""
         return alignment(session["samples"], human["omega"])
 
     def forecast(
         self,
-        session: Session,
+        session: SessionState,
         human: Mapping[str, Any],
         queries: Tensor,
         response_model: ResponseModel,
@@ -132,7 +132,7 @@ class Entropy(Objective):
     no shape of the belief: on the sphere, D-1 bits for every halving of the distances.
     """
 
-    def potential(self, session: Session, human: Mapping[str, Any]) -> Tensor:
+    def potential(self, session: SessionState, human: Mapping[str, Any]) -> Tensor:
         """See :meth:`Objective.potential`."""
         samples = session["samples"]
         nearest = (
@@ -145,7 +145,7 @@ class Entropy(Objective):
 
     def forecast(
         self,
-        session: Session,
+        session: SessionState,
         human: Mapping[str, Any],
         queries: Tensor,
         response_model: ResponseModel,

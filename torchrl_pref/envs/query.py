@@ -13,7 +13,7 @@ from torchrl.data import Composite
 from torchrl_pref.beliefs.base import BeliefBase
 from torchrl_pref.envs.allowed import AllowedActions, Table
 from torchrl_pref.envs.session import SessionEnv
-from torchrl_pref.envs.transition import Session, Tree
+from torchrl_pref.envs.transition import SessionState, Tree
 from torchrl_pref.errors import InputError, check_count, check_flag
 from torchrl_pref.humans.base import HumanBase
 from torchrl_pref.pool import QueryPool
@@ -95,7 +95,7 @@ class QueryEnv(SessionEnv):
         """Whether the whole pool is on the table, in order; an action is then its index."""
         return self.n_candidates == len(self.features)
 
-    def _shown(self, session: Session, hidden: Tree) -> dict[str, Tensor]:
+    def _shown(self, session: SessionState, hidden: Tree) -> dict[str, Tensor]:
         shown, size = super()._shown(session, hidden), len(session["n_asked"])
         if self._shows_all:
             # A view: the whole pool is the same for every session.
@@ -126,7 +126,7 @@ class QueryEnv(SessionEnv):
         terminated = after["n_asked"] >= self.budget
         return self._finish(after, hidden, reward, torch.zeros_like(terminated), terminated)
 
-    def _check_new(self, session: Session, index: Tensor) -> None:
+    def _check_new(self, session: SessionState, index: Tensor) -> None:
         """Refuse to ask pool query ``index`` (B) again in a session that goes on."""
         again = (session["history"]["index"] == index.unsqueeze(-1)).any(-1, keepdim=True)
         if (again & (session["n_asked"] < self.budget)).any():

@@ -48,7 +48,7 @@ from torchrl.envs import EnvBase
 from torchrl_pref.beliefs.base import BeliefBase
 from torchrl_pref.envs.objectives import make_objective
 from torchrl_pref.envs.state import check_state
-from torchrl_pref.envs.transition import Session, Tree, begin, put, rows, tell
+from torchrl_pref.envs.transition import SessionState, Tree, begin, put, rows, tell
 from torchrl_pref.errors import InputError, check_count, check_type
 from torchrl_pref.humans.base import HumanBase
 from torchrl_pref.pool import QueryPool
@@ -89,6 +89,7 @@ class SessionEnv(EnvBase):
         super().__init__(device=device, batch_size=torch.Size(batch_size))
         self.register_buffer("features", pool.features.to(device))
         self.human = human
+        self.n_answers = human.response_model.n_answers(pool.n_options)
         self.belief = belief
         self.objective = objective
         self._objective = make_objective(objective)
@@ -146,7 +147,8 @@ class SessionEnv(EnvBase):
         hidden, session = self._fresh()
         if set_state and tensordict is not None:
             state = TensorDict({**hidden, "session": session}, self.batch_size, device=self.device)
-            given = check_state(tensordict, state, len(self.features)).clone().to_dict()
+            given = check_state(tensordict, state, len(self.features), self.n_answers)
+            given = given.clone().to_dict()
             _overwrite(hidden, given)
             _overwrite(cast(Tree, session), given.get("session", {}))
             session["mean"] = session["samples"].mean(1)
@@ -158,11 +160,11 @@ class SessionEnv(EnvBase):
             {**hidden, "session": session, **shown}, self.batch_size, device=self.device
         )
 
-    def _fresh(self) -> tuple[Tree, Session]:
+    def _fresh(self) -> tuple[Tree, SessionState]:
         """New humans who have answered nothing. The draws that strategies share come first."""
         size, (_, n_options, n_features) = self.batch_size.numel(), self.features.shape
-        rng, n_answers = self.generator, self.human.response_model.n_answers(n_options)
-        human = self.human.draw(size, self.budget, n_answers, n_features, rng).to_dict()
+        rng = self.generator
+        human = self.human.draw(size, self.budget, self.n_answers, n_features, rng).to_dict()
         session = begin(self.belief.prior(size, n_features, rng), self.budget, n_options)
         # The bits of a number of the prior: another one for each session, and no draw more.
         human["number"] = number = session["samples"][:, 0, :1].clone().view(torch.int32)
@@ -173,11 +175,11 @@ class SessionEnv(EnvBase):
         """What is drawn of the questions to come, for B sessions: hidden."""
         return {}
 
-    def _counted(self, session: Session, number: Tensor) -> Session:
+    def _counted(self, session: SessionState, number: Tensor) -> SessionState:
         """Sessions that begin, with their numbers. Subclasses may add what else is counted."""
         return {**session, "number": number}
 
-    def _shown(self, session: Session, hidden: Tree) -> dict[str, Tensor]:
+    def _shown(self, session: SessionState, hidden: Tree) -> dict[str, Tensor]:
         """What a policy sees: copies, which may be rewritten. Subclasses add what is asked."""
         n_asked = session["n_asked"]
         return {
@@ -187,7 +189,7 @@ class SessionEnv(EnvBase):
             "remaining": 1 - n_asked / self.budget,
         }
 
-    def show(self, session: Session) -> TensorDict:
+    def show(self, session: SessionState) -> TensorDict:
         """What a strategy sees of sessions (B) that somebody else keeps, as a live person's."""
         shown = {**self._shown(session, {}), "session": session}
         return TensorDict(shown, self.batch_size, device=self.device)
@@ -195,11 +197,11 @@ class SessionEnv(EnvBase):
     def _put_on_table(self, shown: dict[str, Tensor], begun: Tensor | None) -> None:
         """Tell random actions what is shown now, in all sessions or where they began (B 1)."""
 
-    def _session_of(self, tensordict: TensorDictBase) -> tuple[Tree, Session]:
+    def _session_of(self, tensordict: TensorDictBase) -> tuple[Tree, SessionState]:
         """What is hidden and what is kept of the sessions in a tensordict."""
         session = {**tensordict["session"]}
         session["history"] = {**session["history"]}
-        return self._hidden_of(tensordict), cast(Session, session)
+        return self._hidden_of(tensordict), cast(SessionState, session)
 
     def _hidden_of(self, tensordict: TensorDictBase) -> Tree:
         """What is hidden of sessions: as they carry it, or else as this environment remembers it.
@@ -237,7 +239,9 @@ class SessionEnv(EnvBase):
         check_shape("action", action, self.batch_size, "one number for each session")
         return action
 
-    def _ask(self, session: Session, human: Tree, index: Tensor, asked: Tensor) -> Session:
+    def _ask(
+        self, session: SessionState, human: Tree, index: Tensor, asked: Tensor
+    ) -> SessionState:
         """The sessions after those marked in ``asked`` (B) asked pool query ``index`` (B).
 
         What stays the same is shared with the sessions before: a skip costs next to nothing.
@@ -247,11 +251,11 @@ class SessionEnv(EnvBase):
             return self._answered(session, human, index)
         after: Tree = {**session}
         if len(who):
-            part = cast(Session, rows(session, who))
+            part = cast(SessionState, rows(session, who))
             put(after, self._answered(part, rows(human, who), index[who]), who)
-        return cast(Session, after)
+        return cast(SessionState, after)
 
-    def _answered(self, session: Session, human: Tree, index: Tensor) -> Session:
+    def _answered(self, session: SessionState, human: Tree, index: Tensor) -> SessionState:
         """Sessions (B) after their humans answered pool queries ``index`` (B)."""
         options = self.features[index]
         answers = self.human.respond(options, human, session["n_asked"].squeeze(-1))
@@ -259,7 +263,7 @@ class SessionEnv(EnvBase):
 
     def _finish(
         self,
-        session: Session,
+        session: SessionState,
         hidden: Tree,
         reward: Tensor,
         truncated: Tensor,

@@ -20,7 +20,7 @@ Key = str | tuple[str, ...]
 
 MEANING = {
     "human.omega": "sessions and features",
-    "human.noise": "sessions, asks (the budget) and options",
+    "human.noise": "sessions, asks (the budget) and answers",
     "human.care": "sessions and one factor",
     "session.samples": "sessions, samples of the belief and features",
     "session.mean": "sessions and features",
@@ -38,13 +38,16 @@ NUMBERS = (("human", "number"), ("session", "number"))
 HISTORY: tuple[Key, ...] = tuple(("session", "history", key) for key in History.__annotations__)
 
 
-def check_state(given: TensorDictBase, fresh: TensorDictBase, n_queries: int) -> TensorDict:
+def check_state(
+    given: TensorDictBase, fresh: TensorDictBase, n_queries: int, n_answers: int
+) -> TensorDict:
     """What a tensordict holds of the state of sessions, in the types of a fresh state.
 
     Args:
         given: some or all keys of the state, and any others, which are left out.
         fresh: a whole state of the environment, for its shapes.
         n_queries: N.
+        n_answers: R.
 
     Returns:
         The keys of ``fresh`` that were given.
@@ -62,15 +65,17 @@ def check_state(given: TensorDictBase, fresh: TensorDictBase, n_queries: int) ->
             f"set_state=True with none of {', '.join(map(_name, fresh.keys(True, True)))}: "
             "expected at least one; give humans as env.reset() returns them, or set_state=False"
         )
-    _check_ranges(state, fresh, n_queries)
+    _check_ranges(state, fresh, n_queries, n_answers)
     _check_vectors(state)
     _check_history(state)
     return TensorDict(state, fresh.batch_size, device=fresh.device)
 
 
-def _check_ranges(state: dict[Key, Tensor], fresh: TensorDictBase, n_queries: int) -> None:
+def _check_ranges(
+    state: dict[Key, Tensor], fresh: TensorDictBase, n_queries: int, n_answers: int
+) -> None:
     """Indices point at something, and counts are within the session."""
-    n_asks, n_options = fresh["human", "noise"].shape[1:]
+    n_asks = fresh["session", "history", "answers"].shape[1]
     n_offers = 0 if fresh.get("offers", None) is None else fresh["offers"].shape[1]
     limits: dict[Key, tuple[int, int, str]] = {
         ("session", "history", "index"): (
@@ -78,7 +83,7 @@ def _check_ranges(state: dict[Key, Tensor], fresh: TensorDictBase, n_queries: in
             n_queries - 1,
             "indices of the pool, -1 for no query",
         ),
-        ("session", "history", "answers"): (LEFT_OUT, n_options - 1, "the chosen option or a mark"),
+        ("session", "history", "answers"): (LEFT_OUT, n_answers - 1, "the answer or a mark"),
         "candidates": (0, n_queries - 1, "indices of the pool"),
         "offers": (0, n_queries - 1, "indices of the pool"),
         ("session", "n_asked"): (0, n_asks, "queries asked so far"),

@@ -42,7 +42,7 @@ class History(TypedDict):
     """(B H), index of the query in its pool, or ``NOT_OF_THE_POOL``."""
 
 
-class Session(TypedDict):
+class SessionState(TypedDict):
     """What is known of sessions; it holds nothing of the human but their answers."""
 
     samples: Tensor
@@ -62,7 +62,7 @@ class Session(TypedDict):
     """(B 1), tells a session of an environment from another."""
 
 
-def begin(samples: Tensor, budget: int, n_options: int) -> Session:
+def begin(samples: Tensor, budget: int, n_options: int) -> SessionState:
     """Sessions in which nothing was asked yet.
 
     Args:
@@ -89,12 +89,12 @@ def begin(samples: Tensor, budget: int, n_options: int) -> Session:
 
 def tell(
     belief: BeliefBase,
-    session: Session,
+    session: SessionState,
     options: Tensor,
     answers: Tensor,
     index: Tensor,
     generator: Generator,
-) -> Session:
+) -> SessionState:
     """The sessions after one more answer each.
 
     Args:
@@ -130,7 +130,7 @@ def tell(
             put(after, part, heard)
     after["history"] = _written(session, options, marks, index)
     after["n_asked"] = session["n_asked"] + 1
-    return cast(Session, after)
+    return cast(SessionState, after)
 
 
 def _learn(
@@ -153,7 +153,7 @@ def _learn(
     return torch.where(update.used, answers, LEFT_OUT)
 
 
-def _written(session: Session, options: Tensor, marks: Tensor, index: Tensor) -> History:
+def _written(session: SessionState, options: Tensor, marks: Tensor, index: Tensor) -> History:
     """The history with one more query, at the place of each session's turn."""
     history, turn = session["history"], session["n_asked"]
     place = torch.arange(history["answers"].shape[1], device=turn.device) == turn

@@ -10,7 +10,7 @@ import torch
 from tqdm import tqdm
 
 from torchrl_pref.acquisition.functions import alignment_gain
-from torchrl_pref.build import Settings, Task, load_policy, make_feed_env, make_query_env
+from torchrl_pref.build import Problem, Settings, load_policy, make_feed_env, make_query_env
 from torchrl_pref.checkpoints.checkpoint import Checkpoint
 from torchrl_pref.config.memory import check_memory
 from torchrl_pref.envs.feed import FeedEnv
@@ -38,7 +38,7 @@ def policy_key(settings: Settings) -> str:
 
 def evaluate_task(
     settings: Settings,
-    task: Task,
+    task: Problem,
     learned: Mapping[str, Checkpoint],
     test: QueryPool | None = None,
     own: Mapping[str, Maker] | None = None,
@@ -88,7 +88,7 @@ def check_evaluation(settings: Settings) -> tuple[int, int]:
 
 def compare(
     settings: Settings,
-    task: Task,
+    task: Problem,
     pool: QueryPool,
     learned: Mapping[str, Checkpoint],
     own: Mapping[str, Maker] | None = None,
@@ -139,7 +139,7 @@ def compare(
 
 
 def _load_policy(
-    checkpoint: Checkpoint, task: Task, pool: QueryPool, n_humans: int, seed: int
+    checkpoint: Checkpoint, task: Problem, pool: QueryPool, n_humans: int, seed: int
 ) -> tuple[QueryEnv | FeedEnv, Policy]:
     """A trained policy and the environment of its own setup on a pool."""
     checkpoint.check_fits(pool)
@@ -149,14 +149,14 @@ def _load_policy(
 
 
 def _make_env(
-    settings: Settings, task: Task, pool: QueryPool, n_humans: int, seed: int
+    settings: Settings, task: Problem, pool: QueryPool, n_humans: int, seed: int
 ) -> QueryEnv | FeedEnv:
     """The environment of the settings' setup, with all of a pool on the table."""
     make = make_feed_env if settings["setup"]["name"] == "feed" else make_query_env
     return make(settings, task, pool, n_humans, seed)
 
 
-def try_strategies(own: Mapping[str, Maker], settings: Settings, task: Task) -> None:
+def try_strategies(own: Mapping[str, Maker], settings: Settings, task: Problem) -> None:
     """Refuse strategies of the user that cannot decide in a task, before anything is run.
 
     Raises:
@@ -179,8 +179,8 @@ def _skip_of(checkpoint: Checkpoint) -> str | None:
 
 
 def group_checkpoints(
-    runs: Sequence[tuple[str, Checkpoint, Task]],
-) -> list[tuple[Settings, Task, dict[str, Checkpoint]]]:
+    runs: Sequence[tuple[str, Checkpoint, Problem]],
+) -> list[tuple[Settings, Problem, dict[str, Checkpoint]]]:
     """Put runs that faced the same kind of human on the same pools together.
 
     Args:
@@ -193,7 +193,7 @@ def group_checkpoints(
         InputError: runs with one kind of human were trained with other pools, budgets or beliefs,
             so that they cannot be compared on the same humans.
     """
-    groups: dict[str, list[tuple[str, Checkpoint, Task]]] = {}
+    groups: dict[str, list[tuple[str, Checkpoint, Problem]]] = {}
     for run in runs:
         # As far as tau is the same on every machine that solves for it.
         groups.setdefault(f"{run[2].tau or math.inf:.4g}", []).append(run)

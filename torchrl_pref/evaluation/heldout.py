@@ -30,6 +30,7 @@ from torchrl_pref.evaluation.heldout_pool import (
     try_job,
 )
 from torchrl_pref.evaluation.records import Records
+from torchrl_pref.groups import OWN, TABLES
 
 POOLS, BALANCED_POOLS = 10, 3
 
@@ -106,7 +107,7 @@ def _start_worker() -> None:
     torch.multiprocessing.set_sharing_strategy("file_system")
 
 
-APART = ("policy", "objective", "setup", "belief", "training", "algorithm", "human", "question")
+APART = ("task", "question", "human", "belief", "setup", "policy", "objective", "algorithm")
 """Settings by which policies of one cell are of several kinds; the seed alone makes no kind."""
 
 
@@ -118,7 +119,7 @@ def kinds_of(checkpoints: Sequence[Checkpoint]) -> dict[str, list[Checkpoint]]:
     """
     groups: list[tuple[dict[str, Any], list[Checkpoint]]] = []
     for checkpoint in checkpoints:
-        own = {key: checkpoint.settings[key] for key in (*APART, "pool")}
+        own = {key: checkpoint.settings[key] for key in (*APART, "training", "pool")}
         same = next((members for settings, members in groups if settings == own), None)
         if same is None:
             groups.append((own, same := []))
@@ -148,6 +149,19 @@ def _flat(settings: dict[str, Any]) -> dict[str, Any]:
 
 def _check_fits(settings: Settings, cell: Cell, checkpoint: Checkpoint, first: Checkpoint) -> None:
     """Refuse a policy that cannot be run on other pools, or not on the same offers as the first."""
+    for group in TABLES:
+        if checkpoint.settings[group]["name"] == OWN:
+            raise InputError(
+                f"protocol=heldout: a policy of a run with {group}="
+                f"{checkpoint.settings[group].get('make')}, which is yours; expected runs of what "
+                "is in the package; evaluate yours by checkpoint= without protocol="
+            )
+    if checkpoint.settings["question"] != settings["question"]:
+        raise InputError(
+            f"protocol=heldout asks {settings['question']['name']} questions and the policy was "
+            f"trained for {checkpoint.settings['question']['name']}; evaluate it by checkpoint= "
+            "without protocol="
+        )
     if checkpoint.picks_by_index:
         raise InputError(
             "protocol=heldout: policy=paper in the query setup picks indices of its training pool, "

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from torchrl_pref.acquisition.functions import alignment_gain, information_gain, volume_removal
 from torchrl_pref.build import (
+    Problem,
     Settings,
-    Task,
     draw_pool,
     load_policy,
     make_feed_env,
@@ -109,7 +109,7 @@ class Job:
     own: Sequence[str] = ()
 
 
-def task_and_pool(job: Job) -> tuple[Task, QueryPool]:
+def task_and_pool(job: Job) -> tuple[Problem, QueryPool]:
     """The task, with tau solved on the training pool, and the job's own test pool."""
     settings = job.settings
     train, test = make_pools(settings)
@@ -167,7 +167,7 @@ def run_pool(job: Job) -> list[Entry]:
 
 def _make_env(
     job: Job,
-    task: Task,
+    task: Problem,
     pool: QueryPool,
     seed: int,
     sessions: int,
@@ -201,7 +201,7 @@ def _judged(job: Job, env: QueryEnv | FeedEnv, seed: int) -> list[Entrant]:
     return [*policies, *make_own(find_makers(job.own), env, seed)]
 
 
-def _lineup(job: Job, task: Task, env: QueryEnv | FeedEnv, seed: int) -> list[Entrant]:
+def _lineup(job: Job, task: Problem, env: QueryEnv | FeedEnv, seed: int) -> list[Entrant]:
     """The baselines, and the strong ones again."""
     lineup = [Entrant(*each) for each in _baselines(job, task, env, seed).items()]
     for _ in range(1, RUNS if job.cell.features != "balanced" else 1):
@@ -211,7 +211,7 @@ def _lineup(job: Job, task: Task, env: QueryEnv | FeedEnv, seed: int) -> list[En
 
 
 def _baselines(
-    job: Job, task: Task, env: QueryEnv | FeedEnv, seed: int
+    job: Job, task: Problem, env: QueryEnv | FeedEnv, seed: int
 ) -> dict[str, TensorDictModuleBase]:
     """The strategies that are not learned, by key."""
     model = task.response_model

@@ -7,6 +7,7 @@ several of a kind, after a colon which one (``policy_query:attention``, ``thresh
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
@@ -73,13 +74,12 @@ KINDS: dict[str, Kind] = {
     "policy_query": Kind(Style("RL", "#0072b2", "-"), baseline="greedy_alignment"),
     "policy_feed": Kind(Style("RL-feed", "#d55e00", "-"), feed=True, baseline="quantile_alignment"),
     "start": Kind(Style("the policy before training", "#56b4e9", "--")),
-    "own": Kind(Style("own", "#44aa99", "-")),
+    "own": Kind(Style("own", "#aa4499", "-")),
 }
 """By kind. The colours begin with Okabe and Ito's, told apart by colour-blind readers; ``RL`` and
 ``RL-feed`` are the paper's names; ``own`` are strategies of the user, in either setup."""
 
 SPARE = (
-    ("#44aa99", "-"),
     ("#aa4499", "-"),
     ("#999933", "-"),
     ("#661100", "-"),
@@ -172,7 +172,10 @@ def legend_above(figure: Figure, styles: Mapping[str, Style]) -> None:
         for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
     shown = [key for key in styles if key in handles]
-    columns = max(1, int(figure.get_figwidth() // 2.5))
+    # Inches of the longest name and its line, about: a legend that is too wide is cut off.
+    longest = 0.7 + 0.09 * max(len(styles[key].name) for key in shown)
+    columns = max(1, int(figure.get_figwidth() / longest))
+    figure.set_figheight(figure.get_figheight() + 0.22 * math.ceil(len(shown) / columns))
     figure.legend(
         handles=[handles[key] for key in shown],
         labels=[styles[key].name for key in shown],

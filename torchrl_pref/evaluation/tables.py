@@ -11,7 +11,7 @@ from tabulate import tabulate
 from torch import Tensor
 
 from torchrl_pref.evaluation.records import Records
-from torchrl_pref.evaluation.style import baseline_of, is_feed, is_judged, kind_of, name_of
+from torchrl_pref.evaluation.style import LEARNED, baseline_of, is_feed, is_judged, kind_of, name_of
 from torchrl_pref.evaluation.views import (
     alignment,
     answers_to_reach,
@@ -184,10 +184,10 @@ def many_repeats(records: Records) -> list[str]:
             records.values(key, metric).mean((0, 1)) for metric in ("asked", "repeated")
         )
         if repeated.sum() > asked.sum() / 2:
+            mend = "; drawn actions repeat less: train it with policy.sample=true"
             lines.append(
                 f"! {name_of(key)}: {repeated.mean():.1f} of {asked.mean():.1f} questions had been "
-                "asked before; its most likely action repeats itself: evaluate with drawn actions "
-                "(policy.sample=true when it is trained), or train it further"
+                f"asked before{mend if kind_of(key) in LEARNED else ''}"
             )
     return [*lines, ""] if lines else []
 

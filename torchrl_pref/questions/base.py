@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from torchrl_pref.errors import InputError
-from torchrl_pref.tensors import check_range
+from torchrl_pref.tensors import check_range, check_shape
 
 
 @dataclass(frozen=True)
@@ -87,11 +87,15 @@ class Answers(NamedTuple):
 
 
 class Question(ABC):
-    """A kind of question. Two of the same kind with the same numbers are equal."""
+    """A kind of question. Two of the same kind with the same numbers are equal.
+
+    Attributes are numbers, texts or tuples of them, as tables are kept by them.
+    """
 
     @abstractmethod
     def answers(self, n_options: int) -> Answers:
-        """What can be answered to a query of K options.
+        """What can be answered to a query of K options: probabilities that sum to one, whatever the
+        returns of the options are.
 
         Raises:
             InputError: there is no such question about so many options.
@@ -101,7 +105,13 @@ class Question(ABC):
         return type(self) is type(other) and vars(self) == vars(other)
 
     def __hash__(self) -> int:
-        return hash((type(self), *sorted(vars(self).items())))
+        try:
+            return hash((type(self), *sorted(vars(self).items())))
+        except TypeError:
+            raise InputError(
+                f"{type(self).__name__} with {', '.join(vars(self))}: expected attributes that are "
+                "numbers, texts or tuples of them; make a list a tuple"
+            ) from None
 
     def __repr__(self) -> str:
         numbers = ", ".join(f"{name}={value}" for name, value in vars(self).items())
@@ -111,12 +121,40 @@ class Question(ABC):
 @lru_cache(maxsize=64)
 def answers_on(question: Question, n_options: int, device: torch.device) -> Answers:
     """A question's possible answers, their tensors on a device."""
-    labels, *tensors = question.answers(n_options)
+    answers = question.answers(n_options)
+    _check_answers(question, n_options, answers)
+    labels, *tensors = answers
     return Answers(labels, *(tensor.to(device) for tensor in tensors))
 
 
-def rows_of(question: Question, options: Tensor, answers: Tensor) -> tuple[Tensor, Tensor]:
-    """Rows (… F J D) and offsets (… F J) in logits of answers (…) to queries (… K D).
+def _check_answers(question: Question, n_options: int, answers: Answers) -> None:
+    """Refuse a table whose shapes differ, or whose probabilities do not sum to one.
+
+    Raises:
+        InputError: they do.
+    """
+    labels, contrasts, offsets, log_weights = answers
+    n_factors, n_rows = contrasts.shape[1:3] if contrasts.ndim == 4 else (0, 0)
+    sizes = (len(labels), n_factors, n_rows)
+    for name, tensor, expected in (
+        ("contrasts", contrasts, (*sizes, n_options)),
+        ("offsets", offsets, sizes),
+        ("log_weights", log_weights, sizes[:1]),
+    ):
+        check_shape(f"{name} of {question!r}", tensor, expected, f"for {sizes[0]} answers (labels)")
+    returns = torch.linspace(-1.5, 2.0, 5 * n_options).view(5, n_options).sin() * 2
+    logits = torch.einsum("rfjk,bk->brfj", contrasts, returns) + offsets
+    factors = -torch.log1p((-logits).exp().sum(-1)).sum(-1)
+    total = (factors + log_weights).exp().sum(-1)
+    if (total - 1).abs().max() > 1e-3:
+        raise InputError(
+            f"{question!r}: the probabilities of its answers sum to {float(total[0]):.3g}; "
+            "expected 1 whatever the returns are; look at the offsets and log_weights of its table"
+        )
+
+
+def rows_of(question: Question, options: Tensor, answers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Rows (… F J D), offsets (… F J) in logits, and the answers (…) as int64, of queries (… K D).
 
     Args:
         question: the kind of question.
@@ -134,7 +172,7 @@ def rows_of(question: Question, options: Tensor, answers: Tensor) -> tuple[Tenso
     # A sum and no matrix product: each row is the difference of a few numbers, exactly.
     rows = (table.contrasts[given].unsqueeze(-1) * options[..., None, None, :, :]).sum(-2)
     offsets = torch.where(there, table.offsets[given], torch.inf)
-    return rows * there.unsqueeze(-1), offsets
+    return rows * there.unsqueeze(-1), offsets, answers
 
 
 def check_same(human: Question, belief: Question) -> None:

@@ -40,7 +40,7 @@ def feature_gaps(options: Tensor, answers: Tensor) -> Tensor:
     Raises:
         InputError: an answer is no whole number from -1 to K-1.
     """
-    rows, _ = rows_of(Choice(), options, answers)
+    rows, _, _ = rows_of(Choice(), options, answers)
     return rows.squeeze(-3)
 
 

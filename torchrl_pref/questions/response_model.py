@@ -63,7 +63,7 @@ class ResponseModel(ABC):
         Raises:
             InputError: an answer is no whole number from -1 to R-1.
         """
-        rows, offsets = rows_of(self.question, options, answers)
+        rows, offsets, answers = rows_of(self.question, options, answers)
         floor = torch.zeros_like(answers, dtype=rows.dtype)
         if self.lapse:
             table = self._answers(options.shape[-2], options.device)
@@ -134,6 +134,10 @@ class ResponseModel(ABC):
     def is_plain(self) -> bool:
         """Whether the question is a choice, answered without lapses: closed forms are for this."""
         return not self.lapse and type(self.question) is Choice
+
+    def __repr__(self) -> str:
+        numbers = ", ".join(f"{name}={value}" for name, value in vars(self).items())
+        return f"{type(self).__name__}({numbers})"
 
     def __call__(self, returns: Tensor) -> Tensor:
         """Log-probability of each answer.

@@ -30,6 +30,9 @@ from torchrl_pref.questions.base import Question
 from torchrl_pref.questions.choice import Choice
 from torchrl_pref.questions.response_model import Prediction, ResponseModel
 
+TOLERANCE = 1e-6
+"""Of answers without error, by default."""
+
 MAX_TAU = 1e30
 """Larger and a product with a return is beyond float32; 10⁶ is an optimal human already."""
 
@@ -97,7 +100,7 @@ class Boltzmann(ResponseModel):
         return Prediction(probs, entropy)
 
     def __repr__(self) -> str:
-        return f"Boltzmann(tau={self.tau:g}{_beside(self)})"
+        return f"Boltzmann(tau={shown(self.tau)}{_beside(self)})"
 
 
 @final
@@ -117,7 +120,7 @@ class Optimal(ResponseModel):
     def __init_subclass__(cls, **_: Any) -> None:
         _refuse_subclass(cls, Optimal)
 
-    def __init__(self, tolerance: float = 1e-6, lapse: float = 0.0) -> None:
+    def __init__(self, tolerance: float = TOLERANCE, lapse: float = 0.0) -> None:
         self.tolerance = check_not_negative("tolerance", tolerance)
         self.lapse = _check_lapse(lapse)
 
@@ -161,7 +164,8 @@ class Optimal(ResponseModel):
         return Prediction(torch.stack([winner + 1, 1 - winner]).movedim(0, -1) / 2, entropy)
 
     def __repr__(self) -> str:
-        return f"Optimal({_beside(self)[2:]})"
+        tolerance = "" if self.tolerance == TOLERANCE else f", tolerance={shown(self.tolerance)}"
+        return f"Optimal({(tolerance + _beside(self))[2:]})"
 
 
 def _check_question(question: Any) -> Question:
@@ -188,10 +192,16 @@ def _check_lapse(lapse: Any) -> float:
     return float(lapse)
 
 
+def shown(number: float) -> str:
+    """A number in as few digits as tell it from every other."""
+    short = f"{number:g}"
+    return short if float(short) == number else repr(number)
+
+
 def _beside(model: ResponseModel) -> str:
     """What a model's name says beside its tau."""
     question = "" if type(model.question) is Choice else f", {model.question!r}"
-    return question + (f", lapse={model.lapse:g}" if model.lapse else "")
+    return question + (f", lapse={shown(model.lapse)}" if model.lapse else "")
 
 
 def compiled_constants(response_model: ResponseModel) -> tuple[float, float] | None:

@@ -9,6 +9,9 @@ import torch
 from torchrl_pref.errors import InputError, check_positive
 from torchrl_pref.questions.base import Answers, Question
 
+LARGEST = 100.0
+"""Whoever needs a difference of more calls all that there is equal."""
+
 
 class Weak(Question):
     r"""Pick one of two, or say that they are about equal.
@@ -22,11 +25,13 @@ class Weak(Question):
         threshold: δ, above 0, in the unit of tau times the return.
 
     Raises:
-        InputError: the threshold is not a finite number above 0.
+        InputError: the threshold is not a number above 0 and at most 100.
     """
 
     def __init__(self, threshold: float = 1.0) -> None:
         self.threshold = check_positive("threshold", threshold)
+        if threshold > LARGEST:
+            raise InputError(f"threshold={threshold}: expected at most {LARGEST:g}; lower it")
 
     def answers(self, n_options: int) -> Answers:
         """See :meth:`Question.answers`. Answers 0 and 1 are the options, 2 is "about equal"."""

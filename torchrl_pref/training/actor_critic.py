@@ -53,10 +53,9 @@ class ActorCritic(ABC):
             What :meth:`step` does, the mean over the steps.
         """
 
-    def distribution(self, flat: TensorDictBase) -> Distribution:
-        """Of the actor's actions (F), as its weights are now."""
-        # A copy: the actor leaves its logits where it reads.
-        return self.policy.actor.get_dist(flat.select(*self.policy.actor.in_keys))
+    def acted(self, flat: TensorDictBase) -> Distribution:
+        """What the actions (F) were drawn from, by the logits that the batch has kept of them."""
+        return self.policy.actor[-1].get_dist(flat)
 
     def step(self, flat: TensorDictBase, only_critic: bool) -> dict[str, float]:
         """One gradient step on a batch or a part of it (F).

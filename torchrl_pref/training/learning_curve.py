@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_pref.acquisition.functions import alignment_gain
-from torchrl_pref.build import Settings, Task, make_policy, make_training_env
+from torchrl_pref.build import Problem, Settings, make_policy, make_training_env
 from torchrl_pref.checkpoints.checkpoint import picks_by_index
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
@@ -49,7 +49,7 @@ class LearningCurve:
         InputError: a setting is out of range.
     """
 
-    def __init__(self, settings: Settings, task: Task, trainer: Trainer) -> None:
+    def __init__(self, settings: Settings, task: Problem, trainer: Trainer) -> None:
         n_humans, _ = check_evaluation(settings)
         self.times = settings["evaluation"]["during"]
         self.n_humans, self.seed = min(n_humans, HUMANS), LAST_SEED - settings["evaluation"]["seed"]

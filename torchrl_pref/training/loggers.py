@@ -1,9 +1,8 @@
 """Where the numbers of a training go while it runs: its table, and TorchRL's loggers.
 
-``csv`` is ``training.csv``, a row for each update (:mod:`torchrl_pref.training.progress`): the
-logger of that name in TorchRL writes a file for each metric, and is not used. The others are
+``csv`` is ``training.csv``, a row for each update (:mod:`torchrl_pref.training.progress`).
+TorchRL's logger of that name writes a file for each metric, and is not used. The others are
 TorchRL's.
-
 Each process that trains is a run of its own for ``wandb`` and ``mlflow``: a resumed training is a
 second one, of the same name, that goes on at the update where it was resumed.
 """
@@ -120,8 +119,9 @@ def opened(names: Sequence[str], folder: Path, frames: int) -> Iterator[Logs]:
                 try:
                     loggers.append(LOGGERS[name](folder.absolute(), stack))
                 except Exception as error:  # a disk, a server or an account: none is a defect here
+                    mend = "log in or set WANDB_MODE=offline" if name == "wandb" else "mend that"
                     raise InputError(
-                        f"logger={name} does not start ({type(error).__name__}: {error}); mend "
-                        f"that, or leave {name} out of logger="
+                        f"logger={name} does not start ({type(error).__name__}: {error}); {mend}, "
+                        f"or leave {name} out of logger="
                     ) from error
         yield Logs(loggers, folder / "training.csv" if "csv" in names else None, frames)

@@ -59,8 +59,7 @@ class PPO(ActorCritic):
         """A step on each part of a batch (F), in each pass over it."""
         keys = {*self.policy.actor.in_keys, *self.policy.value.in_keys, "action"}
         shown = flat.select(*keys, "advantage", "value_target")
-        with torch.no_grad():
-            shown["action_log_prob"] = self.distribution(flat).log_prob(flat["action"])
+        shown["action_log_prob"] = self.acted(flat).log_prob(flat["action"])
         steps = [
             self.step(shown[part], only_critic)
             for _ in range(self.epochs)

@@ -20,8 +20,8 @@ from torchrl_pref.policies.base import Policy
 class Sessions:
     """B sessions that go on from one batch to the next; one that ends makes room for another.
 
-    A batch holds what the networks read, and not the samples or the pool: it is a hundredth of what
-    the steps themselves are.
+    A batch holds what the networks read and the logits that the actor gave, and not the samples or
+    the pool: it is a hundredth of what the steps themselves are.
 
     Args:
         env: its batch size is B.
@@ -36,7 +36,7 @@ class Sessions:
     def __init__(self, env: EnvBase, policy: Policy, steps: int) -> None:
         self.env, self.policy, self.steps = env, policy, steps
         self.strategy = policy.strategy
-        self.kept = {*policy.actor.in_keys, *policy.value.in_keys, "action", "n_asked"}
+        self.kept = {*policy.actor.in_keys, *policy.value.in_keys, "logits", "action", "n_asked"}
         self.now: TensorDictBase = env.reset()
         self.now["episode_reward"] = torch.zeros_like(self.now["remaining"][..., :1])
         self.now["step_count"] = torch.zeros_like(self.now["n_asked"])

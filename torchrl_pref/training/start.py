@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from torchrl_pref.build import Settings, Task, make_policy, make_training_env
+from torchrl_pref.build import Problem, Settings, make_policy, make_training_env
 from torchrl_pref.checkpoints.checkpoint import Checkpoint
 from torchrl_pref.errors import check_choice, check_seed
 from torchrl_pref.training.algorithms import ALGORITHMS
@@ -12,7 +12,7 @@ from torchrl_pref.training.settings import TrainingSettings
 from torchrl_pref.training.trainer import Trainer
 
 
-def make_trainer(settings: Settings, task: Task) -> Trainer:
+def make_trainer(settings: Settings, task: Problem) -> Trainer:
     """Environment, policy and algorithm of a run, ready for its first update.
 
     Raises:
@@ -28,7 +28,7 @@ def make_trainer(settings: Settings, task: Task) -> Trainer:
     return Trainer(env, learn(make_policy(settings, env), constants, **own), seed)
 
 
-def make_checkpoint(settings: Settings, task: Task, trainer: Trainer) -> Checkpoint:
+def make_checkpoint(settings: Settings, task: Problem, trainer: Trainer) -> Checkpoint:
     """Everything about a run as it stands."""
     train = task.train
     shape = {"N": len(train), "K": train.n_options, "D": train.n_features}

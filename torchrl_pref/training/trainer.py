@@ -132,8 +132,8 @@ class Trainer:
             batch["steps_to_next_obs"] = batch["next", "n_asked"] - batch["n_asked"]
         with torch.no_grad():
             self.advantage(batch)
-            flat = batch.reshape(-1)
-            entropy = self.algorithm.distribution(flat).entropy().mean().item()
+        flat = batch.reshape(-1)
+        entropy = self.algorithm.acted(flat).entropy().mean().item()
         only_critic = self.progress.update < self.settings.warm_up
         rate = self.algorithm.optimizer.param_groups[0]["lr"]
         told = {"entropy": entropy, "learning_rate": rate}
@@ -171,7 +171,8 @@ class Trainer:
         restore_optimizer(self.algorithm.optimizer, state["optimizer"]["state"])
         now = self.sessions.now
         session = now.select(*self.env.state_spec.keys())
-        restore_sessions(now, state["sessions"], session, len(self.env.features))
+        sizes = len(self.env.features), self.env.n_answers
+        restore_sessions(now, state["sessions"], session, *sizes)
         restore_generator(self.env.generator, state["env_generator"])
         restore_generator(torch.default_generator, state["global_generator"])
 

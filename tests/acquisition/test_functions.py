@@ -1,0 +1,39 @@
+"""What every acquisition function keeps to: the package's, and one written outside of it."""
+
+import my_acquisition
+import pytest
+import torch
+from torch import Generator
+
+from torchrl_pref.acquisition import ACQUISITIONS
+from torchrl_pref.acquisition.functions import Acquisition
+from torchrl_pref.acquisition.scoring import score_in_tensors, score_queries
+from torchrl_pref.beliefs.sampled import uniform_sphere
+from torchrl_pref.questions.response_model import ResponseModel
+from torchrl_pref.questions.responses import Boltzmann, Optimal
+from torchrl_pref.questions.weak import Weak
+
+FUNCTIONS = [*ACQUISITIONS.values(), my_acquisition.least_confidence]
+MODELS = [Boltzmann(4.0), Optimal(), Boltzmann(1e5), Boltzmann(4.0, Weak(0.5), lapse=0.1)]
+
+
+@pytest.mark.parametrize("model", MODELS, ids=str)
+@pytest.mark.parametrize("function", FUNCTIONS)
+def test_values(function: Acquisition, model: ResponseModel, generator: Generator) -> None:
+    samples = uniform_sphere((3, 40, 4), generator)
+    queries = torch.randn(3, 7, 2, 4, generator=generator)
+    queries[0] *= 1e4
+    found = score_queries(samples, queries, model, function)
+    assert found.shape == (3, 7)
+    assert found.isfinite().all()
+    assert (found >= -1e-6).all()
+    # Neither the order of the options nor who else is scored makes a difference.
+    assert torch.allclose(
+        score_queries(samples, queries.flip(2), model, function), found, atol=1e-5
+    )
+    alone = score_queries(samples[1:2], queries[1:2, 3:5], model, function)
+    assert torch.allclose(alone, found[1:2, 3:5], atol=1e-5)
+    assert torch.allclose(score_in_tensors(samples, queries, model, function), found, atol=1e-4)
+    # Nothing is to be had where the belief is certain, and less than from a query that splits it.
+    certain = score_queries(samples[:, :1].expand(3, 40, 4), queries, model, function)
+    assert certain[1:].mean() <= found[1:].mean() + 1e-6

@@ -1,0 +1,36 @@
+"""What every policy keeps to: the package's, and one written outside of it."""
+
+import my_policy
+import pytest
+import torch
+from helpers import ENVS, make
+from torchrl.envs import TransformedEnv
+
+from torchrl_pref.checkpoints.restore import restore_weights
+from torchrl_pref.envs.query import QueryEnv
+from torchrl_pref.policies import POLICIES
+from torchrl_pref.policies.base import PolicyKind
+from torchrl_pref.pool import QueryPool
+
+KINDS = {**POLICIES, "own": PolicyKind(my_policy.perceptron)}
+
+
+@pytest.mark.parametrize("env_kind", ENVS)
+@pytest.mark.parametrize("name", KINDS)
+def test_policies(name: str, env_kind: type, pool: QueryPool) -> None:
+    if name == "own" and env_kind is not QueryEnv:
+        pytest.skip("it is for queries")
+    env = make(env_kind, pool, seed=0)
+    torch.manual_seed(0)
+    policy = KINDS[name].make(env)
+    with torch.random.fork_rng():
+        data = env.rollout(3, policy.strategy)
+    assert data["action"].shape == (4, 3)
+    assert not any(value.requires_grad for value in data.values(True, True))
+    # The critic values any session, and what is learned is saved and loaded.
+    assert policy.critic(env.reset())["state_value"].shape == (4, 1)
+    again = KINDS[name].make(TransformedEnv(make(env_kind, pool, seed=0)))
+    restore_weights(again.weights, policy.weights.state_dict())
+    for mine, other in zip(policy.weights.parameters(), again.weights.parameters(), strict=True):
+        assert torch.equal(mine, other)
+    assert set(KINDS[name].query + KINDS[name].feed) <= set("NKD")

@@ -50,8 +50,8 @@ class Sessions:
     def collect(self) -> TensorDict:
         """The next T steps (B T), with the values that the critic gives to each state and the next.
 
-        A batch holds under ``next``: reward and done flags, ``n_asked``, the alignment, and the
-        ``episode_reward`` and ``step_count`` with the step.
+        A batch holds under ``next``: reward and done flags, ``n_asked``, the alignment where a
+        session ended (else NaN), and the ``episode_reward`` and ``step_count`` with the step.
         """
         records, cut_off = [], []
         with set_exploration_type(ExplorationType.RANDOM):
@@ -78,7 +78,11 @@ class Sessions:
         total = session["episode_reward"] + after["reward"]
         count = session["step_count"] + 1
         kept = {key: after[key] for key in ("reward", "done", "terminated", "n_asked")}
-        kept["alignment"] = alignment(after["session", "samples"], session["human", "omega"])
+        kept["alignment"] = torch.full_like(after["reward"], torch.nan)
+        ended = after["done"].squeeze(-1).nonzero().squeeze(-1)
+        if len(ended):  # of the others nobody asks, and a step would be a tenth slower
+            samples, omega = after["session", "samples"], session["human", "omega"]
+            kept["alignment"][ended] = alignment(samples[ended], omega[ended])
         record["next"] = TensorDict(
             {**kept, "episode_reward": total, "step_count": count}, self.env.batch_size
         )

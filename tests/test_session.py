@@ -122,6 +122,12 @@ def test_what_a_person_would_not_answer_is_not_asked_again(generator: Generator)
     assert len(set(asked)) == 6
 
 
+def test_each_turn_has_luck_of_its_own(generator: Generator) -> None:
+    features = torch.randn(50, 2, 3, generator=generator)
+    session = Session(features, MODEL, "random", budget=6, repeats=True)
+    assert len(set(converse(session, torch.ones(3), 6))) > 3
+
+
 def test_parts_that_contradict_each_other_are_refused(generator: Generator) -> None:
     features = torch.randn(50, 2, 3, generator=generator)
     for given, words in (

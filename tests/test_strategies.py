@@ -8,7 +8,7 @@ from helpers import make, session_of
 from torch import Generator, Tensor
 
 from torchrl_pref.acquisition.functions import alignment_gain, information_gain
-from torchrl_pref.acquisition.scoring import predict_answers
+from torchrl_pref.acquisition.scoring import predict_answers, score_queries
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.objectives import make_objective
 from torchrl_pref.envs.query import QueryEnv
@@ -38,6 +38,13 @@ def test_random_strategies_have_their_own_seeded_luck(pool: QueryPool) -> None:
     assert (RandomAsk(1.0)(offers)["action"] == 1).all()
     with pytest.raises(InputError, match="probability=2"):
         RandomAsk(2)
+
+
+def test_greedy_asks_what_is_worth_most(pool: QueryPool) -> None:
+    env = make(QueryEnv, pool, seed=0)
+    session, model = env.reset(), env.belief.response_model
+    values = score_queries(session["samples"], session["queries"], model, information_gain)
+    assert torch.equal(Greedy(model)(session)["action"], values.argmax(-1))
 
 
 def test_greedy_obeys_the_mask(pool: QueryPool) -> None:

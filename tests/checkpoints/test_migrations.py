@@ -50,6 +50,14 @@ def test_shipped_policies_are_brought_up_to_date(path: Path) -> None:
         assert same(values, was) if was else all(math.isnan(value) for value in values), name
 
 
+def test_no_number_of_older_settings_is_lost() -> None:
+    settings = {"grid": {"size": 5, "length": 7}, "tau_spread": 4, "belief": {"samples": 30}}
+    migrate(settings)
+    assert settings["task"] == {"name": "gridworld", "size": 5, "length": 7}
+    assert settings["human"] == {"name": "simulated", "spread": 4, "lapse": 0.0}
+    assert settings["belief"] == {"name": "sampled", "samples": 30, "lapse": 0.0}
+
+
 def aged(checkpoint: Path) -> None:
     """Make a checkpoint what format 4 wrote."""
     content = torch.load(checkpoint, weights_only=True)

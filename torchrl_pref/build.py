@@ -28,7 +28,7 @@ from torchrl_pref.questions.base import Question
 from torchrl_pref.questions.calibrate import calibrate_tau
 from torchrl_pref.questions.choice import Choice
 from torchrl_pref.questions.response_model import ResponseModel
-from torchrl_pref.questions.responses import Boltzmann, Optimal
+from torchrl_pref.questions.responses import model_of
 from torchrl_pref.tasks.base import make_pool
 
 Settings = dict[str, Any]
@@ -66,12 +66,12 @@ class Problem:
     @property
     def response_model(self) -> ResponseModel:
         """How the belief thinks that the human answers."""
-        return response_model(self.tau, self.question, self.belief_lapse)
+        return model_of(self.tau, self.question, self.belief_lapse)
 
     @property
     def human_model(self) -> ResponseModel:
         """How the human answers."""
-        return response_model(self.tau, self.question, self.human_lapse)
+        return model_of(self.tau, self.question, self.human_lapse)
 
 
 def check_groups(settings: Settings) -> None:
@@ -91,7 +91,7 @@ def check_groups(settings: Settings) -> None:
         number = None if tau == "optimal" else 1.0 if tau == "noisy" else float(tau)
         for section in ("human", "belief"):
             lapse = settings[section]["lapse"]
-            model = response_model(number, question, lapse)
+            model = model_of(number, question, lapse)
             make(section, settings[section], model, without=("lapse",))
     if settings.get("policy", {}).get("name", "pretrained") != "pretrained":
         find("policy", settings["policy"])
@@ -111,22 +111,6 @@ def _try_task(settings: Settings) -> None:
         raise InputError(
             f"task={named}: its first trajectories fail ({where(error)}); mend it, or its settings"
         ) from error
-
-
-def response_model(tau: float | None, question: Question, lapse: float) -> ResponseModel:
-    """How someone answers; tau is None for one who never errs.
-
-    Raises:
-        InputError: a number is out of range, or there is no such human.
-    """
-    if tau is not None:
-        return Boltzmann(tau, question, lapse)
-    if question != Choice():
-        raise InputError(
-            f"tau=optimal with {question!r}: a human who never errs finds nothing about equal; "
-            "expected question=choice, or another tau"
-        )
-    return Optimal(lapse=lapse)
 
 
 def make_pools(settings: Settings) -> tuple[QueryPool, QueryPool]:

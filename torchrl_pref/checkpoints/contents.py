@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchrl_pref.checkpoints.migrations import ADDED_CURVES, TRAINING
 from torchrl_pref.errors import InputError
 from torchrl_pref.groups import TABLES, keys_of
 from torchrl_pref.storage.files import is_dense
@@ -69,21 +70,13 @@ CURVES = (
     "train/episode_length",
     "train/reward",
     "train/explained_variance",
-    "train/actor_loss",
-    "train/critic_loss",
-    "train/entropy",
-    "train/gradient_norm",
-    "train/learning_rate",
-    "train/share_asked",
+    *ADDED_CURVES,
     "time/frames_per_second",
 )
 """What is measured of each update; a history may have more."""
 
 KNOWN = ("update", "history", "held_out", "baseline")
 """How a training went, of every policy."""
-
-TRAINING = ("weights", "optimizer", "sessions", "env_generator", "global_generator")
-"""What training goes on from; a policy that is only used has none of it."""
 
 
 def check_content(content: dict[str, Any]) -> None:

@@ -19,9 +19,8 @@ ADDED_CURVES = (
 )
 """Measured of each update since format 5."""
 
-
-STATE = ("weights", "optimizer", "sessions", "env_generator", "global_generator")
-"""What a training goes on from."""
+TRAINING = ("weights", "optimizer", "sessions", "env_generator", "global_generator")
+"""What training goes on from; a policy that is only used has none of it."""
 
 
 def migrate(settings: Any) -> None:
@@ -60,7 +59,7 @@ def migrate_training(training: Any) -> None:
         history.setdefault(name, [math.nan] * len(rewards))
     # Sessions of before format 5 cannot go on: their history does not hold the options.
     if isinstance(training.get("sessions"), dict) and "session" not in training["sessions"]:
-        for name in STATE:
+        for name in TRAINING:
             training.pop(name, None)
     # Policies of version 0.1.0 were saved without these.
     training.setdefault("update", len(rewards))

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from torchrl_pref.acquisition.functions import alignment_gain, information_gain
+from torchrl_pref.acquisition.functions import Acquisition, alignment_gain, information_gain
 from torchrl_pref.acquisition.scoring import predict_answers, score_queries
 from torchrl_pref.envs.transition import SessionState
 from torchrl_pref.errors import check_choice
@@ -41,13 +41,17 @@ class Objective(ABC):
     """A quantity of a session that a policy is to raise.
 
     A session is what ``tell`` makes of it, and its human has at least ``omega`` (B D).
+
+    Attributes:
+        acquisition: what an answer is expected to add to it, where the belief alone can tell.
     """
+
+    acquisition: Acquisition = staticmethod(information_gain)
 
     @abstractmethod
     def potential(self, session: SessionState, human: Mapping[str, Any]) -> Tensor:
         """What there is of it in a session, (B 1)."""
 
-    @abstractmethod
     def forecast(
         self,
         session: SessionState,
@@ -56,6 +60,7 @@ class Objective(ABC):
         response_model: ResponseModel,
     ) -> Tensor:
         """What asking each of the queries (B C K D) is expected to add, (B C)."""
+        return score_queries(session["samples"], queries, response_model, self.acquisition)
 
     def gained(self, before: SessionState, after: SessionState, human: Mapping[str, Any]) -> Tensor:
         """What there is more of it after than before, (B 1)."""
@@ -69,16 +74,6 @@ class InformationGain(Objective):
         """See :meth:`Objective.potential`."""
         return session["information"]
 
-    def forecast(
-        self,
-        session: SessionState,
-        human: Mapping[str, Any],
-        queries: Tensor,
-        response_model: ResponseModel,
-    ) -> Tensor:
-        """See :meth:`Objective.forecast`."""
-        return score_queries(session["samples"], queries, response_model, information_gain)
-
 
 class Alignment(Objective):
     """The length of the mean belief squared: the alignment that the belief itself expects.
@@ -87,19 +82,11 @@ class Alignment(Objective):
     its expectation without the noise of the one hidden ω.
     """
 
+    acquisition = staticmethod(alignment_gain)
+
     def potential(self, session: SessionState, human: Mapping[str, Any]) -> Tensor:
         """See :meth:`Objective.potential`."""
         return session["mean"].square().sum(-1, keepdim=True)
-
-    def forecast(
-        self,
-        session: SessionState,
-        human: Mapping[str, Any],
-        queries: Tensor,
-        response_model: ResponseModel,
-    ) -> Tensor:
-        """See :meth:`Objective.forecast`."""
-        return score_queries(session["samples"], queries, response_model, alignment_gain)
 
 
 class TrueAlignment(Objective):
@@ -129,7 +116,8 @@ class Entropy(Objective):
     """What the belief has lost of its entropy, in bits, up to a constant.
 
     By the distance of each sample to its third nearest (Kozachenko and Leonenko, 1987), which needs
-    no shape of the belief: on the sphere, D-1 bits for every halving of the distances.
+    no shape of the belief: on the sphere, D-1 bits for every halving of the distances. Its expected
+    loss is the information gain.
     """
 
     def potential(self, session: SessionState, human: Mapping[str, Any]) -> Tensor:
@@ -142,16 +130,6 @@ class Entropy(Objective):
         )
         bits = nearest.clamp(min=1e-7).log2().mean(-1, keepdim=True)
         return -(samples.shape[-1] - 1) * bits
-
-    def forecast(
-        self,
-        session: SessionState,
-        human: Mapping[str, Any],
-        queries: Tensor,
-        response_model: ResponseModel,
-    ) -> Tensor:
-        """The expected loss of entropy is the information gain."""
-        return score_queries(session["samples"], queries, response_model, information_gain)
 
 
 OBJECTIVES: dict[str, Objective] = {

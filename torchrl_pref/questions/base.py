@@ -17,7 +17,6 @@ simulated humans and the compiled loops know all kinds alike.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -48,12 +47,6 @@ class Evidence:
     def __getitem__(self, index: Any) -> Evidence:
         """The evidence of some of the answers, by an index of the leading dimensions."""
         return Evidence(self.rows[index], self.offsets[index], self.floor[index])
-
-    @staticmethod
-    def cat(parts: Sequence[Evidence], dim: int) -> Evidence:
-        """Evidence one after the other, along one of the leading dimensions."""
-        fields = ((part.rows, part.offsets, part.floor) for part in parts)
-        return Evidence(*(torch.cat(field, dim) for field in zip(*fields, strict=True)))
 
     def expand(self, *leading: int) -> Evidence:
         """The same evidence for more leading dimensions, as views."""

@@ -123,7 +123,7 @@ class ResponseModel(ABC):
 
     def n_answers(self, n_options: int) -> int:
         """R, how many answers there are to a query of K options."""
-        return len(self.question.answers(n_options).labels)
+        return len(self._answers(n_options, torch.device("cpu")).labels)
 
     @property
     def is_soft(self) -> bool:

@@ -204,6 +204,22 @@ def _beside(model: ResponseModel) -> str:
     return question + (f", lapse={shown(model.lapse)}" if model.lapse else "")
 
 
+def model_of(tau: float | None, question: Question, lapse: float) -> ResponseModel:
+    """How someone answers; tau is None for one who never errs.
+
+    Raises:
+        InputError: a number is out of range, or there is no such human.
+    """
+    if tau is not None:
+        return Boltzmann(tau, question, lapse)
+    if question != Choice():
+        raise InputError(
+            f"tau=optimal with {question!r}: a human who never errs finds nothing about equal; "
+            "expected question=choice, or another tau"
+        )
+    return Optimal(lapse=lapse)
+
+
 def compiled_constants(response_model: ResponseModel) -> tuple[float, float] | None:
     """What the compiled loops know a model by: tau and tolerance; None for others than ours."""
     if isinstance(response_model, Boltzmann):

@@ -29,6 +29,7 @@ ORDER = [
     "evaluation",
     "training",
     "pretrained",
+    "saved_session",
     "session",
     "sweeps",
 ]

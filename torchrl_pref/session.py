@@ -29,11 +29,9 @@ from torchrl_pref.errors import (
 from torchrl_pref.humans.simulated import SimulatedHuman
 from torchrl_pref.pool import Normalizer, QueryPool
 from torchrl_pref.questions.response_model import ResponseModel
+from torchrl_pref.saved_session import FORMAT, check_content
 from torchrl_pref.strategies import STRATEGIES, MakeStrategy
 from torchrl_pref.tensors import check_finite, check_plain
-
-FORMAT = 1
-"""Of what :meth:`Session.to_dict` makes."""
 
 PRIME = 1_000_003
 """Between the seeds of two sessions there is room for so many answers."""
@@ -340,42 +338,3 @@ def _made(strategy: str | MakeStrategy, env: QueryEnv) -> TensorDictModuleBase:
     made = strategy(env)
     check_type("what strategy makes of an environment", made, TensorDictModuleBase, "Greedy(…)")
     return made
-
-
-def check_content(content: Any) -> None:
-    """Refuse what :meth:`Session.to_dict` did not make.
-
-    Raises:
-        InputError: a part is missing or no plain number.
-    """
-
-    def numbers(rows: Any) -> bool:
-        return isinstance(rows, list) and all(type(one) is int for one in rows)
-
-    def turns(rows: Any) -> bool:
-        return isinstance(rows, list) and all(map(numbers, rows))
-
-    checks = {
-        "format": lambda value: value == FORMAT,
-        "pool": lambda value: isinstance(value, str),
-        "response_model": lambda value: isinstance(value, str),
-        "belief": lambda value: isinstance(value, str),
-        "strategy": lambda value: isinstance(value, str),
-        "repeats": lambda value: type(value) is bool,
-        "budget": lambda value: type(value) is int,
-        "people": lambda value: value is None or type(value) is int,
-        "seed": lambda value: type(value) is int,
-        "queries": turns,
-        "answers": turns,
-        "asked": lambda value: value is None or numbers(value),
-    }
-    if not isinstance(content, dict):
-        raise InputError(f"a session of type {type(content).__name__}: expected a dict")
-    for key, fits in checks.items():
-        if key not in content or not fits(content[key]):
-            raise InputError(
-                f"{key} of a session is {content.get(key, 'missing')!s:.60}: expected what "
-                f"Session.to_dict() makes, in its format {FORMAT}"
-            )
-    if len(content["queries"]) != len(content["answers"]):
-        raise InputError("a session with a query too many or an answer: expected as many of each")

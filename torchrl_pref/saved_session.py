@@ -1,0 +1,49 @@
+"""What a saved session must hold, as plain JSON: structure only, not whether the numbers fit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torchrl_pref.errors import InputError
+
+FORMAT = 1
+"""Of what ``Session.to_dict`` makes."""
+
+
+def check_content(content: Any) -> None:
+    """Refuse what ``Session.to_dict`` did not make.
+
+    Raises:
+        InputError: a part is missing or no plain number.
+    """
+
+    def numbers(rows: Any) -> bool:
+        return isinstance(rows, list) and all(type(one) is int for one in rows)
+
+    def turns(rows: Any) -> bool:
+        return isinstance(rows, list) and all(map(numbers, rows))
+
+    checks = {
+        "format": lambda value: value == FORMAT,
+        "pool": lambda value: isinstance(value, str),
+        "response_model": lambda value: isinstance(value, str),
+        "belief": lambda value: isinstance(value, str),
+        "strategy": lambda value: isinstance(value, str),
+        "repeats": lambda value: type(value) is bool,
+        "budget": lambda value: type(value) is int,
+        "people": lambda value: value is None or type(value) is int,
+        "seed": lambda value: type(value) is int,
+        "queries": turns,
+        "answers": turns,
+        "asked": lambda value: value is None or numbers(value),
+    }
+    if not isinstance(content, dict):
+        raise InputError(f"a session of type {type(content).__name__}: expected a dict")
+    for key, fits in checks.items():
+        if key not in content or not fits(content[key]):
+            raise InputError(
+                f"{key} of a session is {content.get(key, 'missing')!s:.60}: expected what "
+                f"Session.to_dict() makes, in its format {FORMAT}"
+            )
+    if len(content["queries"]) != len(content["answers"]):
+        raise InputError("a session with a query too many or an answer: expected as many of each")

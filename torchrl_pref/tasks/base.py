@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchrl_pref.errors import check_count
 from torchrl_pref.pool import QueryPool
+from torchrl_pref.tasks.scene import Label, Patch, Scene
 
 
 class Task(ABC):
@@ -29,6 +30,11 @@ class Task(ABC):
     @abstractmethod
     def features(self, trajectories: Tensor) -> Tensor:
         """Features (… D) of trajectories (… T …), not normalised."""
+
+    def scene(self, trajectory: Tensor) -> Scene:
+        """What a person is shown of one trajectory (T …); the features as bars, where a task has
+        nothing better."""
+        return feature_bars(self.feature_names, self.features(trajectory))
 
 
 def make_pool(task: Task, n_queries: int, n_options: int, seed: int) -> QueryPool:
@@ -49,3 +55,14 @@ def make_pool(task: Task, n_queries: int, n_options: int, seed: int) -> QueryPoo
     features = task.features(trajectories)
     shape = (n_queries, n_options)
     return QueryPool(features.unflatten(0, shape), trajectories.unflatten(0, shape))
+
+
+def feature_bars(names: tuple[str, ...], features: Tensor) -> Scene:
+    """Named features (D) as bars, in one frame."""
+    bars = []
+    for row, (name, value) in enumerate(zip(names, features.tolist(), strict=True)):
+        low, high = -row - 0.8, -row - 0.4
+        bars.append(Patch(((0.0, low), (value, low), (value, high), (0.0, high)), "#4477aa"))
+        bars.append(Label((0.0, -row - 0.2), f"{name}: {value:.3g}"))
+    reach = max(1e-9, float(features.abs().max())) * 1.1
+    return Scene((-reach, -float(len(names))), (reach, 0.0), (), (tuple(bars),), equal=False)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchrl_pref.errors import check_count
 from torchrl_pref.pool import QueryPool
-from torchrl_pref.tasks.scene import Label, Patch, Scene
+from torchrl_pref.tasks.scene import Label, Patch, Scene, Shape
 
 
 class Task(ABC):
@@ -59,7 +59,7 @@ def make_pool(task: Task, n_queries: int, n_options: int, seed: int) -> QueryPoo
 
 def feature_bars(names: tuple[str, ...], features: Tensor) -> Scene:
     """Named features (D) as bars, in one frame."""
-    bars = []
+    bars: list[Shape] = []
     for row, (name, value) in enumerate(zip(names, features.tolist(), strict=True)):
         low, high = -row - 0.8, -row - 0.4
         bars.append(Patch(((0.0, low), (value, low), (value, high), (0.0, high)), "#4477aa"))

@@ -9,10 +9,10 @@ import shlex
 import shutil
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import FrameType
-from typing import Any, TextIO
+from typing import Any, TextIO, cast
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Quote, QuotedString
@@ -25,6 +25,7 @@ from omegaconf.errors import OmegaConfBaseException
 import typed
 from help_text import help_text
 from torchrl_pref import runs, sweeps
+from torchrl_pref.config.sections import Plain, Settings
 from torchrl_pref.config.settings import open_groups
 from torchrl_pref.errors import InputError, one_line_errors
 
@@ -33,7 +34,7 @@ class Terminated(KeyboardInterrupt):
     """SIGTERM, which stops a program as Ctrl-C does."""
 
 
-def main(job: Callable[[], Any], check: Callable[[dict[str, Any]], None]) -> None:
+def main(job: Callable[[], Any], check: Callable[[Plain], Any]) -> None:
     """Run a Hydra job; input that cannot be used ends it with one line and status 2.
 
     Args:
@@ -107,7 +108,7 @@ class _Unbroken:
         return written
 
 
-def allow_typed(settings: dict[str, Any]) -> None:
+def allow_typed(settings: Plain) -> None:
     """Let the code be imported that the user typed, as in ``policy=mine:make``."""
     typed_by_user = [group for group in typed.GROUPS if typed.was_typed(f"{group}.make")]
     if typed_by_user:
@@ -117,7 +118,7 @@ def allow_typed(settings: dict[str, Any]) -> None:
             allow(settings[group]["make"])
 
 
-def refuse_other_code(settings: dict[str, Any], new: dict[str, Any]) -> None:
+def refuse_other_code(settings: Mapping[str, Any], new: Mapping[str, Any]) -> None:
     """Refuse code of the user's own, or settings of it, that a run was not made with.
 
     Args:
@@ -144,7 +145,7 @@ def refuse_other_code(settings: dict[str, Any], new: dict[str, Any]) -> None:
                     )
 
 
-def check_groups(settings: dict[str, Any]) -> None:
+def check_groups(settings: Plain) -> None:
     """Make what the groups choose, where no table can check it: that takes the heavy imports.
 
     Raises:
@@ -153,10 +154,10 @@ def check_groups(settings: dict[str, Any]) -> None:
     if open_groups(settings):
         from torchrl_pref.build import check_groups
 
-        check_groups(settings)
+        check_groups(cast(Settings, settings))
 
 
-def use_threads(settings: dict[str, Any]) -> None:
+def use_threads(settings: Settings) -> None:
     """Set torch to the number of threads in the settings."""
     import torch
 

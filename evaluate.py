@@ -19,6 +19,7 @@ from omegaconf import DictConfig
 import app
 import typed
 from torchrl_pref import runs
+from torchrl_pref.config.sections import Plain, Settings
 from torchrl_pref.config.settings import check_evaluate_settings
 from torchrl_pref.errors import InputError, one_line_errors
 from torchrl_pref.runs import CHECKPOINT
@@ -60,14 +61,12 @@ def job(config: DictConfig) -> None:
                     f"{folder} holds a run, whose tables and figures would be overwritten; name "
                     "another folder by hydra.run.dir="
                 )
-            settings = typed.plain_settings(config)
-            check(settings)
-            evaluate(settings, folder)
+            evaluate(check(typed.plain_settings(config)), folder)
     finally:
         app.discard_if_empty(folder)
 
 
-def check(settings: dict[str, Any]) -> None:
+def check(settings: Plain) -> Settings:
     """Refuse what cannot be evaluated.
 
     Raises:
@@ -97,12 +96,13 @@ def check(settings: dict[str, Any]) -> None:
             f"policy={settings['policy'].get('make')}: a policy of yours is evaluated as it was "
             "trained; add checkpoint=<its run folder>, or name a strategy by strategy="
         )
-    check_evaluate_settings(settings)
+    checked = check_evaluate_settings(settings)
     app.check_groups(settings)
-    own_strategies(settings)
+    own_strategies(checked)
+    return checked
 
 
-def evaluate(settings: dict[str, Any], folder: Path) -> None:
+def evaluate(settings: Settings, folder: Path) -> None:
     """What the settings ask for, reported in a folder."""
     from torchrl_pref.evaluation import reports
     from torchrl_pref.training import figure
@@ -127,7 +127,7 @@ def listed(value: Any) -> list[Any]:
     return value if isinstance(value, list) else [value]
 
 
-def own_strategies(settings: dict[str, Any]) -> dict[str, Maker]:
+def own_strategies(settings: Settings) -> dict[str, Maker]:
     """What makes the strategies that the user typed.
 
     Raises:
@@ -141,7 +141,7 @@ def own_strategies(settings: dict[str, Any]) -> dict[str, Maker]:
 
 
 def evaluate_taus(
-    settings: dict[str, Any], learned_for: Callable[[Any], dict[str, Checkpoint]]
+    settings: Settings, learned_for: Callable[[Any], dict[str, Checkpoint]]
 ) -> Records:
     """The baselines and what was learned for each tau, a task each."""
     from torchrl_pref import build
@@ -159,7 +159,7 @@ def evaluate_taus(
     return records
 
 
-def pretrained_for(settings: dict[str, Any], tau: Any) -> dict[str, Checkpoint]:
+def pretrained_for(settings: Settings, tau: Any) -> dict[str, Checkpoint]:
     """The policy that comes with the package for a tau, under the settings of this evaluation."""
     from torchrl_pref.evaluation.comparison import policy_key
     from torchrl_pref.pretrained import pretrained_checkpoint
@@ -170,7 +170,7 @@ def pretrained_for(settings: dict[str, Any], tau: Any) -> dict[str, Checkpoint]:
     return {f"{policy_key(checkpoint.settings)}:pretrained": checkpoint}
 
 
-def run_heldout(settings: dict[str, Any]) -> Records:
+def run_heldout(settings: Settings) -> Records:
     """The held-out protocol, for checkpoints or for the policies that come with the package."""
     from torchrl_pref.checkpoints.checkpoint import Checkpoint
     from torchrl_pref.evaluation import heldout
@@ -212,9 +212,7 @@ def find_checkpoints(named: list[str]) -> list[Path]:
     return paths
 
 
-def evaluate_checkpoints(
-    settings: dict[str, Any], paths: list[Path]
-) -> tuple[Records, list[Training]]:
+def evaluate_checkpoints(settings: Settings, paths: list[Path]) -> tuple[Records, list[Training]]:
     """Learned policies beside random and greedy, a task for each kind of human, and the trainings
     behind them."""
     from torchrl_pref import build

@@ -6,6 +6,7 @@ that help and refusals come at once.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +19,7 @@ import typed
 from torchrl_pref import runs, sweeps
 from torchrl_pref.checkpoints.migrations import migrate
 from torchrl_pref.config.memory import check_memory
+from torchrl_pref.config.sections import Plain, Settings
 from torchrl_pref.config.settings import check_run, check_train_settings
 from torchrl_pref.errors import InputError
 from torchrl_pref.runs import CHECKPOINT
@@ -45,13 +47,13 @@ def job(config: DictConfig) -> float:
     return app.do_job(partial(run, config))
 
 
-def check(settings: dict[str, Any]) -> None:
+def check(settings: Plain) -> Settings:
     """Refuse what cannot be trained.
 
     Raises:
         InputError: a setting is out of range, or was typed where a checkpoint decides.
     """
-    check_train_settings(settings)
+    checked = check_train_settings(settings)
     app.allow_typed(settings)
     if settings["resume"] is None:
         app.check_groups(settings)
@@ -59,12 +61,12 @@ def check(settings: dict[str, Any]) -> None:
         own = tuple(group for group in typed.GROUPS if typed.was_typed(f"{group}.make"))
         allowed = ("training.updates", *OF_THE_MACHINE, "hydra.")
         typed.refuse_other_overrides("resume", allowed, own)
+    return checked
 
 
 def run(config: DictConfig, made: Path) -> float:
     """A new run in the folder made for it, or one to go on with, in its own."""
-    settings = typed.plain_settings(config)
-    check(settings)
+    settings = check(typed.plain_settings(config))
     resume = settings.pop("resume")
     if resume is not None:
         folder = run_folder(Path(str(resume)))
@@ -109,7 +111,7 @@ def run_folder(path: Path) -> Path:
     return path.resolve()
 
 
-def refuse_other_run(folder: Path, settings: dict[str, Any]) -> None:
+def refuse_other_run(folder: Path, settings: Settings) -> None:
     """Refuse to go on with a run that has other settings.
 
     Raises:
@@ -129,7 +131,7 @@ def refuse_other_run(folder: Path, settings: dict[str, Any]) -> None:
         )
 
 
-def flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested settings by their dotted keys."""
     found: dict[str, Any] = {}
     for key, value in settings.items():
@@ -139,7 +141,7 @@ def flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return found
 
 
-def load_config(folder: Path) -> dict[str, Any]:
+def load_config(folder: Path) -> Plain:
     """The configuration that a run was started with.
 
     Raises:
@@ -155,7 +157,7 @@ def load_config(folder: Path) -> dict[str, Any]:
     return {str(key): value for key, value in settings.items()}
 
 
-def begin(folder: Path, settings: dict[str, Any]) -> float:
+def begin(folder: Path, settings: Settings) -> float:
     """A new run in a folder, from the settings as typed."""
     settings["overrides"] = typed.typed_overrides()
     if settings["checkpoint"] is not None:
@@ -163,7 +165,7 @@ def begin(folder: Path, settings: dict[str, Any]) -> float:
     return start(folder, settings)
 
 
-def start(folder: Path, settings: dict[str, Any]) -> float:
+def start(folder: Path, settings: Settings) -> float:
     """The first update of a run, and all that follow."""
     from torchrl_pref import build
     from torchrl_pref.checkpoints.checkpoint import Checkpoint
@@ -183,29 +185,27 @@ def start(folder: Path, settings: dict[str, Any]) -> float:
         build.load_weights(trainer.policy, checkpoint)
         trainer.start_average()
     with app.resumable(folder):
-        write_text(folder / CONFIG, OmegaConf.to_yaml(OmegaConf.create(settings)))
+        write_text(folder / CONFIG, OmegaConf.to_yaml(OmegaConf.create({**settings})))
         for pool, name in zip(pools, POOLS, strict=True):
             pool.save(folder / name)
         del settings["checkpoint"]  # no more than where the weights began
         return train(folder, settings, task, trainer)
 
 
-def go_on(folder: Path, new: dict[str, Any]) -> float:
+def go_on(folder: Path, new: Settings) -> float:
     """An old run, from its last checkpoint or its start, with its own settings."""
     from torchrl_pref import build
     from torchrl_pref.checkpoints.checkpoint import Checkpoint
     from torchrl_pref.training.start import make_trainer
 
     checkpoint = Checkpoint.load(folder) if (folder / CHECKPOINT).exists() else None
-    settings = load_config(folder) if checkpoint is None else checkpoint.settings
-    for key in OF_THE_MACHINE:
-        if typed.was_typed(key):
-            settings[key] = new[key]
+    plain: Plain = load_config(folder) if checkpoint is None else {**checkpoint.settings}
+    other = [key for key in OF_THE_MACHINE if typed.was_typed(key)]
+    settings = check_run(plain | {key: value for key, value in new.items() if key in other})
     if typed.was_typed("training.updates"):
         updates = settings["training"]["updates"] = new["training"]["updates"]
         others = [o for o in settings["overrides"] if not o.startswith("training.updates=")]
         settings["overrides"] = [*others, f"training.updates={updates}"]
-    check_run(settings)
     app.refuse_other_code(settings, new)
     if checkpoint is None:
         print(f"{folder}: was stopped before its first checkpoint and starts again")
@@ -236,7 +236,7 @@ def check_trained(path: Path, checkpoint: Checkpoint) -> None:
         )
 
 
-def train(folder: Path, settings: dict[str, Any], task: Problem, trainer: Trainer) -> float:
+def train(folder: Path, settings: Settings, task: Problem, trainer: Trainer) -> float:
     """Train, evaluate on the held-out pool, report."""
     from torchrl_pref.evaluation import comparison, reports
     from torchrl_pref.training import figure

@@ -19,9 +19,8 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from torchrl_pref.config.sections import Plain
 from torchrl_pref.errors import InputError, one_line_errors
-
-Settings = dict[str, Any]
 
 GROUPS = ("policy", "task", "question", "human", "belief")
 """Groups of which ``<group>=<module>:<name>`` chooses something of the user's own."""
@@ -30,7 +29,7 @@ GROUPS = ("policy", "task", "question", "human", "belief")
 class Gate(Callback):
     """Refuses what was typed before Hydra makes a folder for it."""
 
-    check: Callable[[Settings], None] | None = None
+    check: Callable[[Plain], None] | None = None
     """The script's own."""
     passed = False
     """Whether errors are no longer the input's."""
@@ -152,7 +151,7 @@ def told_hydra(arguments: list[str]) -> list[str]:
     return told
 
 
-def plain_settings(config: DictConfig) -> Settings:
+def plain_settings(config: DictConfig) -> Plain:
     """The composed configuration as plain values.
 
     Raises:

@@ -17,6 +17,7 @@ from torchrl.envs import EnvBase
 from torchrl_pref.beliefs.sampled import uniform_sphere
 from torchrl_pref.checkpoints.checkpoint import Checkpoint, picks_by_index
 from torchrl_pref.checkpoints.restore import restore_weights
+from torchrl_pref.config.sections import Settings
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.envs.session import is_feed
@@ -30,8 +31,6 @@ from torchrl_pref.questions.choice import Choice
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.questions.responses import model_of
 from torchrl_pref.tasks.base import make_pool
-
-Settings = dict[str, Any]
 
 NOISY_ACCURACY = 0.9
 """The paper's "noisy user (90%)"."""
@@ -123,10 +122,12 @@ def make_pools(settings: Settings) -> tuple[QueryPool, QueryPool]:
         InputError: a setting or a file cannot be used.
     """
     pool = settings["pool"]
-    given = [name for name in ("train", "test") if pool[name] is not None]
+    given = {"train": pool["train"], "test": pool["test"]}
+    given = {name: path for name, path in given.items() if path is not None}
     if len(given) == 1:
+        name, path = given.popitem()
         raise InputError(
-            f"pool.{given[0]}={pool[given[0]]} alone: the other pool would be the task's; "
+            f"pool.{name}={path} alone: the other pool would be the task's; "
             "expected both pool.train and pool.test of your own, or neither"
         )
     # Each pool takes two seeds.
@@ -242,8 +243,8 @@ def make_feed_env(
     """The feed environment on a normalised pool, by the sections ``setup`` and ``belief``."""
     setup = settings["setup"]
     common = _session_arguments(settings, task, sessions, seed)
-    kinds = {"on_skip": setup["on_skip"], "skip": settings["skip"]}
-    return FeedEnv(pool, offers=setup["offers"], **kinds, **common)
+    common |= {"on_skip": setup["on_skip"], "skip": settings["skip"]}
+    return FeedEnv(pool, offers=setup["offers"], **common)
 
 
 def make_training_env(

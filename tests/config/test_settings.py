@@ -8,7 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, get_type_hints, is_typeddict
 
 import pytest
 from hydra import compose, initialize_config_dir
@@ -19,7 +19,7 @@ from benchmarks.bad_settings import FAULTS, every_command, run_forked
 from torchrl_pref.beliefs import sampled as belief
 from torchrl_pref.beliefs import slice as sampler
 from torchrl_pref.checkpoints import contents
-from torchrl_pref.config import checks, memory, settings
+from torchrl_pref.config import checks, memory, sections, settings
 from torchrl_pref.envs import objectives
 from torchrl_pref.errors import InputError, one_line
 from torchrl_pref.policies import attention
@@ -58,6 +58,27 @@ def test_every_default_of_a_training_is_legal(setup: str, policy: str, algorithm
 @pytest.mark.parametrize("typed", ["setup=query", "setup=feed", "+policy=pretrained"])
 def test_every_default_of_an_evaluation_is_legal(typed: str) -> None:
     settings.check_evaluate_settings(composed("evaluate", typed.lstrip("+")))
+
+
+@pytest.mark.parametrize("setup", ["feed", "query"])
+@pytest.mark.parametrize("script", ["train", "evaluate"])
+def test_the_types_of_the_sections_name_the_keys_of_conf_and_their_values(
+    script: str, setup: str
+) -> None:
+    typed = composed(script, f"setup={setup}")
+    hints = get_type_hints(sections.Settings)
+    assert typed.keys() - hints.keys() == set()
+    for key, value in typed.items():
+        section = hints[key]
+        if not is_typeddict(section):
+            assert section == sections.GroupSection or not isinstance(value, dict), key
+            continue
+        inner = get_type_hints(section)
+        assert value.keys() - {"name"} <= inner.keys(), key
+        ours = {name for name in inner if "NotRequired" not in str(section.__annotations__[name])}
+        assert ours <= value.keys(), key
+        for name, number in value.items():
+            assert isinstance(number, inner[name]), (key, name)
 
 
 def test_moves_may_be_left_to_the_belief() -> None:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchrl_pref.checkpoints.contents import check_content
 from torchrl_pref.checkpoints.migrations import migrate, migrate_training
+from torchrl_pref.config.sections import Settings
 from torchrl_pref.errors import InputError
 from torchrl_pref.policies import POLICIES
 from torchrl_pref.pool import Normalizer, QueryPool, save_atomically
@@ -26,12 +27,12 @@ READABLE = (4, FORMAT)
 """Formats that can be read, the older ones by :mod:`torchrl_pref.checkpoints.migrations`."""
 
 
-def picks_by_index(settings: dict[str, Any]) -> bool:
+def picks_by_index(settings: Settings) -> bool:
     """Whether a policy of these settings picks an index of its training pool."""
     return "N" in bound_to(settings)
 
 
-def bound_to(settings: dict[str, Any]) -> str:
+def bound_to(settings: Settings) -> str:
     """Which of N, K and D may not change for a policy of these settings."""
     kind = POLICIES.get(settings["policy"]["name"])
     return "" if kind is None else str(getattr(kind, settings["setup"]["name"]))
@@ -51,7 +52,7 @@ class Checkpoint:
         training: what the training loop needs to go on, bit for bit.
     """
 
-    settings: dict[str, Any]
+    settings: Settings
     tau: float | None
     mean: Tensor
     std: Tensor

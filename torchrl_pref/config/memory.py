@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from torchrl_pref.config.sections import Settings
 from torchrl_pref.errors import InputError
 
 N_FEATURES = 4
@@ -41,7 +42,7 @@ class Part(NamedTuple):
     """Settings that it grows with."""
 
 
-def check_memory(settings: dict[str, Any], *pool_shape: int) -> None:
+def check_memory(settings: Settings, *pool_shape: int) -> None:
     """Refuse sizes that cannot fit into this machine's memory.
 
     Args:
@@ -61,7 +62,7 @@ def check_memory(settings: dict[str, Any], *pool_shape: int) -> None:
         )
 
 
-def parts_of(settings: dict[str, Any], *pool_shape: int) -> Iterator[Part]:
+def parts_of(settings: Settings, *pool_shape: int) -> Iterator[Part]:
     """What a run keeps in memory, estimated."""
     pool, task, setup = settings["pool"], settings["task"], settings["setup"]
     n_queries, n_options, n_features = pool_shape or (pool["size"], pool["options"], N_FEATURES)
@@ -92,7 +93,7 @@ def parts_of(settings: dict[str, Any], *pool_shape: int) -> Iterator[Part]:
     yield from _belief_parts(settings, n_options, n_features)
 
 
-def _shown(settings: dict[str, Any], n_queries: int, n_options: int, n_features: int) -> float:
+def _shown(settings: Settings, n_queries: int, n_options: int, n_features: int) -> float:
     """Bytes for each step of a training session that the queries on the table take."""
     if settings["setup"]["name"] == "feed":
         return 40.0 * n_options * n_features
@@ -113,7 +114,7 @@ def default_moves(n_features: int) -> int:
     return max(4, n_features, n_features**2 // 8, n_features**3 // 128)
 
 
-def _belief_parts(settings: dict[str, Any], n_options: int, n_features: int) -> Iterator[Part]:
+def _belief_parts(settings: Settings, n_options: int, n_features: int) -> Iterator[Part]:
     """What an update of the belief holds at once, for sessions in groups of so many samples."""
     belief, budget = settings["belief"], settings["setup"]["budget"]
     sessions = settings.get("training", {}).get("sessions", 0)
@@ -132,7 +133,7 @@ def _belief_parts(settings: dict[str, Any], n_options: int, n_features: int) -> 
         yield Part("objective=entropy", distances, ("belief.samples", "evaluation.humans"))
 
 
-def _offers(settings: dict[str, Any]) -> int:
+def _offers(settings: Settings) -> int:
     """O, 0 where queries are not offered."""
     setup = settings["setup"]
     if setup["name"] != "feed":
@@ -157,7 +158,7 @@ def _has_sysconf() -> bool:
     return "SC_PHYS_PAGES" in getattr(os, "sysconf_names", {})
 
 
-def _value_of(settings: dict[str, Any], key: str) -> Any:
+def _value_of(settings: Settings, key: str) -> Any:
     """The value of a dotted key."""
     value: Any = settings
     for name in key.split("."):

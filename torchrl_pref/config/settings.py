@@ -11,7 +11,7 @@ Settings are nested dicts of plain values, as composed by Hydra or read from a c
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 from torchrl_pref.config.checks import (
     LARGEST_THREADS,
@@ -29,6 +29,7 @@ from torchrl_pref.config.checks import (
     positive,
 )
 from torchrl_pref.config.memory import check_memory
+from torchrl_pref.config.sections import Plain, Settings
 from torchrl_pref.errors import (
     InputError,
     check_choice,
@@ -37,8 +38,6 @@ from torchrl_pref.errors import (
     check_seed,
     check_share,
 )
-
-Settings = dict[str, Any]
 
 OBJECTIVES = ("information_gain", "alignment", "true_alignment", "entropy")
 
@@ -150,17 +149,17 @@ OF_TRAINING: Groups = {
 SECTIONS = ("pool", "evaluation", "training", "setup", "policy", "algorithm", *OTHERS)
 
 
-def check_train_settings(settings: Settings) -> None:
+def check_train_settings(settings: Plain) -> Settings:
     """Refuse what train.py cannot start or go on with.
 
     Raises:
         InputError: a key is missing, unknown or out of its range, or two do not go together.
     """
     _check_keys(settings, TASK | TRAINING | TRAIN_DOOR, OF_TRAINING)
-    check_run(settings)
+    return check_run(settings)
 
 
-def check_run(settings: Settings) -> None:
+def check_run(settings: Plain) -> Settings:
     """Refuse the settings of a training, of train.py's or of a checkpoint's.
 
     Raises:
@@ -175,10 +174,12 @@ def check_run(settings: Settings) -> None:
             f"policy.start={policy['start']}: in the feed the scorer starts from the quantile "
             "rule; leave policy.start out, or set setup=query"
         )
-    check_memory(own)
+    checked = cast(Settings, settings)
+    check_memory(checked)
+    return checked
 
 
-def check_evaluate_settings(settings: Settings) -> None:
+def check_evaluate_settings(settings: Plain) -> Settings:
     """Refuse what evaluate.py cannot do.
 
     Raises:
@@ -196,10 +197,12 @@ def check_evaluate_settings(settings: Settings) -> None:
                 f"policy=pretrained with skip={settings['skip']}: the pretrained feed policies "
                 "were trained with free skips and a budget of asks; expected skip=free; remove skip"
             )
-    check_memory(settings)
+    checked = cast(Settings, settings)
+    check_memory(checked)
+    return checked
 
 
-def _check_keys(settings: Settings, table: Mapping[str, Check], groups: Groups) -> None:
+def _check_keys(settings: Plain, table: Mapping[str, Check], groups: Groups) -> None:
     """Hold every key to its check, and the keys to the table and to the chosen groups' own."""
     for section in SECTIONS:
         if not isinstance(settings.get(section, {}), dict):
@@ -226,7 +229,7 @@ def _check_keys(settings: Settings, table: Mapping[str, Check], groups: Groups) 
 
 
 def _group_checks(
-    settings: Settings, group: str, tables: Mapping[str, Mapping[str, Check]]
+    settings: Plain, group: str, tables: Mapping[str, Mapping[str, Check]]
 ) -> dict[str, Check]:
     """The checks of what a group chooses."""
     options = " or ".join(f"{group}={name}" for name in tables)
@@ -239,7 +242,7 @@ def _group_checks(
     return {f"{group}.name": choice(name), **tables[name]}
 
 
-def open_groups(settings: Settings) -> list[str]:
+def open_groups(settings: Plain) -> list[str]:
     """The groups whose settings are checked by what is made of them, and not by a table here."""
     known = {**OTHERS, "policy": {**POLICIES, **PRETRAINED}}
     chosen = {group: settings.get(group, {}).get("name") for group in known}
@@ -254,7 +257,7 @@ def _anything(name: str, value: Any) -> None:
     """What is checked elsewhere."""
 
 
-def _flat(settings: Settings) -> dict[str, Any]:
+def _flat(settings: Plain) -> dict[str, Any]:
     """The values by dotted key; what is no section of ours counts as a value."""
     flat: dict[str, Any] = {}
     for key, value in settings.items():
@@ -265,13 +268,13 @@ def _flat(settings: Settings) -> dict[str, Any]:
     return flat
 
 
-def _chosen(settings: Settings) -> str:
+def _chosen(settings: Plain) -> str:
     """The groups that decide which keys there are."""
     groups = {group: settings.get(group, {}).get("name") for group in OF_TRAINING}
     return " and ".join(f"{group}={name}" for group, name in groups.items() if name is not None)
 
 
-def _check_together(settings: Settings) -> None:
+def _check_together(settings: Plain) -> None:
     """Refuse values that are right one by one and wrong together."""
     pool, setup, belief = settings["pool"], settings["setup"], settings["belief"]
     given = [name for name in ("train", "test") if pool[name] is not None]

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tqdm import tqdm
 
 from torchrl_pref.acquisition.functions import alignment_gain
-from torchrl_pref.build import Problem, Settings, load_policy, make_feed_env, make_query_env
+from torchrl_pref.build import Problem, load_policy, make_feed_env, make_query_env
 from torchrl_pref.checkpoints.checkpoint import Checkpoint
 from torchrl_pref.config.memory import check_memory
+from torchrl_pref.config.sections import Settings
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.errors import InputError, check_count, check_flag, check_seed
@@ -58,7 +59,7 @@ def evaluate_task(
     """
     pools = {HELD_OUT: task.test if test is None else test}
     evaluated = {key: value for key, value in settings.items() if key != "training"}
-    check_memory(evaluated, *pools[HELD_OUT].features.shape)
+    check_memory(cast(Settings, evaluated), *pools[HELD_OUT].features.shape)
     if any(checkpoint.picks_by_index for checkpoint in learned.values()):
         pools[TRAINING] = task.train
     records = Records()
@@ -222,9 +223,14 @@ def group_checkpoints(
             same = sum(policy_key(other.settings) == kind for _, other, _ in members)
             learned[kind if same == 1 else f"{kind}:{name}"] = checkpoint
         # Baselines choose as the query runs may; a feed among them adds its offers.
-        settings = dict(first.settings)
-        feed_last = sorted(all_of, key=lambda c: bool(c.settings["setup"]["name"] == "feed"))
-        settings["setup"] = {k: v for c in feed_last for k, v in c.settings["setup"].items()}
-        settings["skip"] = feed_last[-1].settings["skip"]
+        feed_last = sorted(all_of, key=lambda c: c.settings["setup"]["name"] == "feed")
+        setup = first.settings["setup"]
+        for checkpoint in feed_last:
+            setup = {**setup, **checkpoint.settings["setup"]}
+        settings: Settings = {
+            **first.settings,
+            "setup": setup,
+            "skip": feed_last[-1].settings["skip"],
+        }
         tasks.append((settings, task, learned))
     return tasks

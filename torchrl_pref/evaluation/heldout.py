@@ -16,9 +16,9 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from torchrl_pref.build import Settings
 from torchrl_pref.checkpoints.checkpoint import Checkpoint
 from torchrl_pref.compiled import share_out
+from torchrl_pref.config.sections import Plain, Settings
 from torchrl_pref.errors import InputError
 from torchrl_pref.evaluation.comparison import policy_key
 from torchrl_pref.evaluation.heldout_pool import (
@@ -119,7 +119,8 @@ def kinds_of(checkpoints: Sequence[Checkpoint]) -> dict[str, list[Checkpoint]]:
     """
     groups: list[tuple[dict[str, Any], list[Checkpoint]]] = []
     for checkpoint in checkpoints:
-        own = {key: checkpoint.settings[key] for key in (*APART, "training", "pool")}
+        plain: Plain = {**checkpoint.settings}
+        own = {key: plain[key] for key in (*APART, "training", "pool")}
         same = next((members for settings, members in groups if settings == own), None)
         if same is None:
             groups.append((own, same := []))
@@ -138,7 +139,7 @@ def kinds_of(checkpoints: Sequence[Checkpoint]) -> dict[str, list[Checkpoint]]:
     return keys
 
 
-def _flat(settings: dict[str, Any]) -> dict[str, Any]:
+def _flat(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Values by dotted key."""
     flat: dict[str, Any] = {}
     for key, value in settings.items():
@@ -149,11 +150,12 @@ def _flat(settings: dict[str, Any]) -> dict[str, Any]:
 
 def _check_fits(settings: Settings, cell: Cell, checkpoint: Checkpoint, first: Checkpoint) -> None:
     """Refuse a policy that cannot be run on other pools, or not on the same offers as the first."""
+    plain: Plain = {**checkpoint.settings}
     for group in TABLES:
-        if checkpoint.settings[group]["name"] == OWN:
+        if plain[group]["name"] == OWN:
             raise InputError(
                 f"protocol=heldout: a policy of a run with {group}="
-                f"{checkpoint.settings[group].get('make')}, which is yours; expected runs of what "
+                f"{plain[group].get('make')}, which is yours; expected runs of what "
                 "is in the package; evaluate yours by checkpoint= without protocol="
             )
     if checkpoint.settings["question"] != settings["question"]:

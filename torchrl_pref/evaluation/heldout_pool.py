@@ -17,7 +17,6 @@ from torch import Tensor
 from torchrl_pref.acquisition.functions import alignment_gain, information_gain, volume_removal
 from torchrl_pref.build import (
     Problem,
-    Settings,
     draw_pool,
     load_policy,
     make_feed_env,
@@ -26,6 +25,7 @@ from torchrl_pref.build import (
     make_task,
 )
 from torchrl_pref.checkpoints.checkpoint import Checkpoint
+from torchrl_pref.config.sections import Settings
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.envs.session import is_feed

@@ -14,8 +14,9 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_pref.acquisition.functions import alignment_gain
-from torchrl_pref.build import Problem, Settings, make_policy, make_training_env
+from torchrl_pref.build import Problem, make_policy, make_training_env
 from torchrl_pref.checkpoints.checkpoint import picks_by_index
+from torchrl_pref.config.sections import Settings
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.envs.session import is_feed

@@ -1,0 +1,95 @@
+"""The settings of a run, section by section: which keys there are, and of what type.
+
+Nothing here has a default: these stand in ``conf/`` alone, and what values are allowed in
+``config.settings``. Settings come from Hydra or from a checkpoint, as nested dicts of plain values.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NotRequired, TypeAlias, TypedDict
+
+Plain: TypeAlias = dict[str, Any]
+"""Settings as they were composed or read: nobody has looked at them yet."""
+
+GroupSection: TypeAlias = dict[str, Any]
+"""The section of a group: its ``name``, and the arguments of what that stands for, which may be a
+stranger's class."""
+
+
+class PoolSection(TypedDict):
+    """``pool``: where queries come from."""
+
+    size: int
+    options: int
+    seed: int
+    train: str | None
+    test: str | None
+
+
+class EvaluationSection(TypedDict):
+    """``evaluation``: on whom strategies are judged."""
+
+    humans: int
+    seed: int
+    during: NotRequired[int]
+
+
+class SetupSection(TypedDict):
+    """``setup``: what the action is; which keys there are follows from its name."""
+
+    name: str
+    budget: int
+    candidates: NotRequired[int | None]
+    repeats: NotRequired[bool]
+    offers: NotRequired[int | None]
+    on_skip: NotRequired[str]
+
+
+class TrainingSection(TypedDict):
+    """``training``: the constants of every algorithm."""
+
+    updates: int
+    sessions: int
+    steps: int | None
+    optimizer: str
+    learning_rate: float
+    gamma: float
+    lmbda: float
+    entropy: float
+    critic: float
+    critic_steps: int
+    grad_norm: float
+    warm_up: int
+    average: float
+    save_every: int
+
+
+class Settings(TypedDict):
+    """All of them, checked. What only one of the two scripts has need not be there."""
+
+    tau: Any
+    objective: str
+    skip: str
+    device: str
+    threads: int
+    pool: PoolSection
+    evaluation: EvaluationSection
+    setup: SetupSection
+    task: GroupSection
+    question: GroupSection
+    human: GroupSection
+    belief: GroupSection
+    policy: NotRequired[GroupSection]
+    # Of train.py, and of a checkpoint.
+    algorithm: NotRequired[GroupSection]
+    training: NotRequired[TrainingSection]
+    seed: NotRequired[int]
+    overrides: NotRequired[list[str]]
+    logger: NotRequired[list[str]]
+    resume: NotRequired[str | None]
+    # Of evaluate.py.
+    protocol: NotRequired[str | None]
+    workers: NotRequired[int]
+    strategy: NotRequired[str | list[str] | None]
+    # Of both: a file to start from, or those to compare.
+    checkpoint: NotRequired[Any]

@@ -40,6 +40,7 @@ PROTOCOL_KEYS = (
     "setup.offers",
     "strategy",
     "belief.",
+    "task",
     "task.",
     "pool.size",
     "pool.options",

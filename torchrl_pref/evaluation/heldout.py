@@ -43,7 +43,7 @@ def run_protocol(
 ) -> Records:
     """Run all cells for which there are policies.
 
-    On the Gridworld there are ten pools that no training used. On a pool of the user's
+    Of a task there are ten pools that no training used. On a pool of the user's
     (``pool.train`` and ``pool.test``) ten groups of humans face the test pool, all of it: intervals
     are over groups, and tell of other humans on that pool and not of other pools.
 
@@ -87,10 +87,8 @@ def _jobs(
             _check_fits(settings, cell, checkpoint, checkpoints[0])
         kinds = kinds_of(checkpoints)
         settings = {**settings, "skip": checkpoints[0].settings["skip"]}
-        cells = [(cell, POOLS)]
-        if settings["pool"]["test"] is not None:
-            cells = [(cell._replace(features="own"), POOLS)]
-        elif cell.setup == "query":
+        cells = [(cell._replace(features=features_of(settings)), POOLS)]
+        if cells[0][0] == Cell("query", cell.tau):
             cells.append((cell._replace(features="balanced"), BALANCED_POOLS))
         jobs += [
             Job(settings, each, pool, kinds, own=own)
@@ -98,6 +96,14 @@ def _jobs(
             for pool in range(count)
         ]
     return jobs
+
+
+def features_of(settings: Settings) -> str:
+    """What the features of the cells are called."""
+    if settings["pool"]["test"] is not None:
+        return "own"
+    task: str = settings["task"]["name"]
+    return "corners" if task == "gridworld" else task
 
 
 def _start_worker() -> None:

@@ -75,8 +75,8 @@ FIT_HUMANS = 400
 
 
 class Cell(NamedTuple):
-    """One kind of task: ``query`` or ``feed``, the human's tau, and the features: ``corners`` or
-    ``balanced`` of the Gridworld, or those of the user's ``own`` pool."""
+    """``query`` or ``feed``, the human's tau, and the features: ``corners`` or ``balanced`` of the
+    Gridworld, the name of another task, or those of the user's ``own`` pool."""
 
     setup: str
     tau: str | float

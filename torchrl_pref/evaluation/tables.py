@@ -48,8 +48,8 @@ def title_of(task: str) -> str:
         return task
     tau, features = rest.split("/")
     human = f"{tau} human" if tau in ("noisy", "optimal") else f"tau={tau} human"
-    added = {"balanced": ", balanced features", "own": ", own pool"}.get(features, "")
-    return f"{setup}, {human}{added}"
+    known = {"corners": "", "balanced": ", balanced features", "own": ", own pool"}
+    return f"{setup}, {human}{known.get(features, f', {features}')}"
 
 
 def counts(records: Records) -> str:

@@ -207,8 +207,9 @@ def _artist(axes: Axes, shape: Shape, scene: Scene) -> Artist:
     match shape:
         case Line():
             xs, ys = zip(*shape.points, strict=True)
-            look = {"color": shape.colour, "linewidth": shape.width}
-            return axes.add_line(Line2D(xs, ys, linestyle="--" if shape.dashed else "-", **look))
+            line = Line2D(xs, ys, linewidth=shape.width, color=shape.colour)
+            line.set_linestyle("--" if shape.dashed else "-")
+            return axes.add_line(line)
         case Patch():
             return axes.add_patch(Polygon(shape.points, facecolor=shape.colour, linewidth=0))
         case Disc():

@@ -1,7 +1,10 @@
 """LDS: a linear dynamical system of three points, each pushed along a line of its own.
 
 From Bıyık et al. (*Asking easy questions: a user-friendly approach to active reward learning*, CoRL
-2019) and their released code.
+2019) and their released code, which sends each of its 15 inputs to all three points. The released
+scales are the spread of the features under those inputs; the three speed features are then one and
+the same. Over 2,000 random motions of either kind the states that their code gives in float64 are
+those here, and the features differ by at most 5.4e-15.
 
 Shapes: T = 25 steps, D = 6 features, ``…`` any leading dimensions.
 """

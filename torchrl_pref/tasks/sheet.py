@@ -108,13 +108,8 @@ def sheet(
         _text(figure, left, top + 0.05, f"{number + 1}", 9)
         bars_left = left + n_options * (width + MARGIN)
         feature_bars(figure, (bars_left, top - rows_high, BARS, rows_high), scores[number], names)
-    _text(
-        figure,
-        2 * MARGIN,
-        0.1,
-        f"Bars: features, ±{SPREAD:g} standard deviations of the sheet",
-        7.5,
-    )
+    note = f"Bars: the options' features, ±{SPREAD:g} standard deviations over this sheet"
+    _text(figure, 2 * MARGIN, 0.1, note, 7.5)
     return figure
 
 

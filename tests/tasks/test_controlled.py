@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Callable, Sequence
 
@@ -11,7 +12,7 @@ from torch import Generator, Tensor
 
 from torchrl_pref.errors import InputError
 from torchrl_pref.tasks.controlled import ControlledTask
-from torchrl_pref.tasks.driver import DriverTask
+from torchrl_pref.tasks.driver import DriverTask, car
 from torchrl_pref.tasks.lds import LDSTask
 from torchrl_pref.tasks.scene import Disc, Line, Patch
 
@@ -25,15 +26,15 @@ def drive_by_hand(controls: Numbers) -> list[float]:
     totals = [0.0] * 4
     for step in range(50):
         part = step // 10
-        for car, (steer, gas) in (
+        for state, (steer, gas) in (
             (robot, (controls[2 * part], controls[2 * part + 1])),
             (other, plan[part]),
         ):
-            x, y, theta, v = car
-            car[0] = x + 0.1 * v * math.cos(theta)
-            car[1] = y + 0.1 * v * math.sin(theta)
-            car[2] = theta + 0.1 * v * steer
-            car[3] = v + 0.1 * (gas - v)
+            x, y, theta, v = state
+            state[0] = x + 0.1 * v * math.cos(theta)
+            state[1] = y + 0.1 * v * math.sin(theta)
+            state[2] = theta + 0.1 * v * steer
+            state[3] = v + 0.1 * (gas - v)
         x, y, theta, v = robot
         off = min((x - 0.17) ** 2, x**2, (x + 0.17) ** 2)
         totals[0] += math.exp(-30 * off)
@@ -183,7 +184,12 @@ def test_inputs_as_released_are_a_switch() -> None:
 
 
 def test_cars_point_where_they_head() -> None:
-    """A drive that keeps straight on: the front of the car is above its middle."""
+    """A car anywhere is one at the origin, turned and moved; one that keeps straight on is seen at
+    its length, and its trail begins where it started."""
+    expected = [complex(*point) for point in car((0, 0, 0, 1), "#000000").points]
+    assert max(point.real for point in expected) == pytest.approx(0.1)
+    turned = [complex(*point) for point in car((3, -2, 0.7, 1), "#000000").points]
+    assert turned == pytest.approx([3 - 2j + point * cmath.exp(0.7j) for point in expected])
     task = DriverTask()
     scene = task.scene(task.roll_out(torch.tensor([0.0, 1.0] * 5)))
     assert len(scene.frames) == 50

@@ -16,7 +16,7 @@ from torchrl_pref.tasks import TASKS, drawing
 from torchrl_pref.tasks.__main__ import main
 from torchrl_pref.tasks.base import make_pool
 from torchrl_pref.tasks.drawing import save_animation, save_picture
-from torchrl_pref.tasks.gridworld import GridworldTask
+from torchrl_pref.tasks.gridworld import WALKER, GridworldTask
 from torchrl_pref.tasks.scene import Disc, Label, Line, Patch, Picture, Scene
 from torchrl_pref.tasks.sheet import columns_of, contact_sheet, widened
 
@@ -152,6 +152,12 @@ def test_a_sheet_shows_every_query(name: str, tmp_path: Path) -> None:
     for word in ("A", "B", "1", "2", "3", *task.feature_names):
         shown = len(re.findall(rf"<!-- {re.escape(word)} -->|>{re.escape(word)}</text>", text))
         assert shown >= (1 if word.isdigit() else 3), word
+
+
+def test_a_sheet_shows_where_trajectories_end(tmp_path: Path) -> None:
+    task = GridworldTask(3, 4)
+    contact_sheet(task, make_pool(task, 5, 3, 0), tmp_path / "sheet.svg")
+    assert (tmp_path / "sheet.svg").read_text().count(f"fill: {WALKER}") == 15
 
 
 def test_a_sheet_refuses_what_it_cannot_show(tmp_path: Path) -> None:

@@ -180,7 +180,7 @@ def panel(figure: Figure, place: tuple[float, float, float, float], scene: Scene
     (left, low), (right, high) = box
     axes.set(xlim=(left, right), ylim=(low, high), xticks=[], yticks=[])
     for spine in axes.spines.values():
-        spine.set(color="#bbbbbb", linewidth=0.8, zorder=1e6)
+        spine.set(color="#bbbbbb", linewidth=0.8, zorder=2)
     draw(axes, scene.still, scene)
     return axes
 
@@ -194,11 +194,9 @@ def axes_at(figure: Figure, place: tuple[float, float, float, float]) -> Axes:
 
 def draw(axes: Axes, shapes: Sequence[Shape], scene: Scene) -> list[Artist]:
     """Draw shapes of a scene on top of what is there; what is returned can be removed again."""
-    drawn = []
-    for order, shape in enumerate(shapes, start=len(axes.get_children())):
-        artist = _artist(axes, shape, scene)
-        artist.set(zorder=order, clip_on=True)
-        drawn.append(artist)
+    drawn = [_artist(axes, shape, scene) for shape in shapes]
+    for artist in drawn:
+        artist.set(zorder=1, clip_on=True)  # of equals, the later is on top
     return drawn
 
 

@@ -99,6 +99,15 @@ def pretrained(folder: Path) -> dict[str, str]:
     return {}
 
 
+def gallery(folder: Path) -> dict[str, str]:
+    """The pictures of the gallery."""
+    (DOCS / "gallery").mkdir(exist_ok=True)
+    for task in GALLERY:
+        for kind in ("png", "gif"):
+            shutil.copy(folder / f"{task}.{kind}", DOCS / "gallery")
+    return {}
+
+
 def heldout(folder: Path) -> dict[str, str]:
     """A table for each cell of the protocol, its figure, and its curves."""
     records = read_records(folder / CSV)
@@ -217,6 +226,8 @@ def measured(name: str, page: str, minutes: float, more: str = "") -> Part:
 SWEEP = "hydra.sweep.dir={folder}/sweep"
 TWO = "hydra/launcher=joblib hydra.launcher.n_jobs=2"
 CELLS = [f"{setup}-{tau}" for setup in ("feed", "query") for tau in ("noisy", "optimal")]
+GALLERY = ("gridworld", "driver", "lds")
+SHEET = "python -m torchrl_pref.tasks {task} --animate --out {{folder}}/{task}.png -> {task}.gif"
 START = "policy.start=information_gain training.learning_rate=0.01 training.updates=200"
 
 PARTS: dict[str, Part] = {
@@ -225,6 +236,9 @@ PARTS: dict[str, Part] = {
         (f"python evaluate.py policy=pretrained setup=query hydra.run.dir={{folder}} -> {CSV}",),
         0.5,
         pretrained,
+    ),
+    "gallery": Part(
+        "docs/gallery.md", tuple(SHEET.format(task=task) for task in GALLERY), 0.5, gallery
     ),
     "heldout": Part(
         "docs/results.md",

@@ -6,6 +6,7 @@ import functools
 import importlib
 import re
 import shlex
+from importlib.util import find_spec
 from itertools import chain, product
 from pathlib import Path
 
@@ -20,6 +21,7 @@ import typed
 from benchmarks import docs_figures
 from torchrl_pref.config.settings import check_evaluate_settings, check_train_settings
 from torchrl_pref.evaluation.records import Entry, Records
+from torchrl_pref.tasks import TASKS
 
 ROOT = Path(__file__).parents[1]
 CARD = ROOT / "torchrl_pref" / "policies" / "weights" / "README.md"
@@ -119,7 +121,7 @@ NO_SETTINGS = ("actor", "csv", "png", "py", "strategy")
 def known_keys() -> set[str]:
     """Every key that either script has, whatever is chosen."""
     groups = ("setup=query", "setup=feed", "question=weak", "policy=attention", "policy=scorer")
-    typed_here = [("train", one) for one in (*groups, "algorithm=ppo")]
+    typed_here = [("train", one) for one in (*groups, "algorithm=ppo", "task=lds")]
     typed_here += [("evaluate", one) for one in groups[:3]]
     keys = set(chain(*(keys_of(OmegaConf.create(composed(*one))) for one in typed_here)))
     return keys | {key.partition(".")[0] for key in keys} | {"experiment"}
@@ -194,9 +196,25 @@ def test_parts_of_the_docs_are_made_by_commands_that_are_accepted(name: str) -> 
         command, _, left = line.partition(" -> ")
         assert left
         script = ROOT / command.split()[1]
+        if script.name == "-m":
+            assert find_spec(command.split()[2]) is not None
+            continue
         assert script.exists()
         if script.parent == ROOT:
             test_commands_are_accepted(ROOT, command.format(folder="x").partition(" ")[2])
+
+
+@pytest.mark.parametrize("name", docs_figures.GALLERY)
+def test_the_gallery_shows_a_task(name: str) -> None:
+    """Its section has the command, the picture, and each feature by its name."""
+    sections = (ROOT / "docs" / "gallery.md").read_text().split("\n## ")
+    section = next(one for one in sections if f"`task={name}`" in one.splitlines()[0])
+    assert f"python -m torchrl_pref.tasks {name}" in section
+    for kind in ("png", "gif"):
+        assert f"(gallery/{name}.{kind})" in section
+        assert (ROOT / "docs" / "gallery" / f"{name}.{kind}").stat().st_size < 200_000
+    for feature in TASKS[name].feature_names:
+        assert feature in section
 
 
 def test_a_cell_of_the_protocol_is_a_table() -> None:

@@ -1,6 +1,7 @@
 """What every task keeps to: the package's, and one written outside of it."""
 
 from collections.abc import Callable
+from itertools import chain
 
 import my_task
 import pytest
@@ -11,6 +12,7 @@ from torchrl_pref.pool import Normalizer
 from torchrl_pref.tasks import TASKS
 from torchrl_pref.tasks.base import Task, make_pool
 from torchrl_pref.tasks.gridworld import GridworldTask, gridworld_pool
+from torchrl_pref.tasks.scene import Disc, Label, Line, Patch, Scene, Shape, corners
 
 MAKE = [*TASKS.values(), my_task.Table]
 
@@ -35,6 +37,7 @@ def test_features_have_names_and_vary(make: Callable[[], Task]) -> None:
     Normalizer.fit(features)  # finite, and each varies
     singles = torch.stack([task.features(one) for one in trajectories])
     assert torch.allclose(features, singles, atol=1e-6)
+    assert torch.allclose(features[:7], task.features(trajectories[:7]), atol=1e-6)
     pairs = task.features(trajectories.unflatten(0, (30, 2)))
     assert torch.equal(pairs.flatten(0, 1), features)
 
@@ -50,5 +53,54 @@ def test_pools(make: Callable[[], Task]) -> None:
             make_pool(make(), *bad, seed=0)
 
 
+@pytest.mark.parametrize("make", MAKE)
+def test_a_scene_stays_within_its_corners(make: Callable[[], Task]) -> None:
+    task = make()
+    for trajectory in task.trajectories(20, 3):
+        scene = task.scene(trajectory)
+        assert scene.frames
+        (left, low), (right, high) = scene.low, scene.high
+        assert left < right
+        assert low < high
+        for x, y in chain(*(points_of(shape) for frame in scene.frames for shape in frame)):
+            assert left - 1e-6 <= x <= right + 1e-6
+            assert low - 1e-6 <= y <= high + 1e-6
+
+
+def points_of(shape: Shape) -> list[tuple[float, float]]:
+    """The outermost points of a shape."""
+    match shape:
+        case Line() | Patch():
+            return list(shape.points)
+        case Disc():
+            (x, y), radius = shape.centre, shape.radius
+            return [(x - radius, y - radius), (x + radius, y + radius)]
+        case Label():
+            return [shape.at]
+    return []
+
+
+def test_scenes_are_shown_at_one_scale() -> None:
+    near, far = Scene((0, -1), (1, 2), (), ((),)), Scene((-3, 0), (0.5, 5), (), ((),))
+    assert corners([near, far]) == ((-3, -1), (1, 5))
+
+
 def test_the_gridworlds_pool_is_the_tasks() -> None:
     assert gridworld_pool(9, 2, 5, 7, 3).digest == make_pool(GridworldTask(5, 7), 9, 2, 3).digest
+
+
+def test_a_walk_is_seen_where_it_was() -> None:
+    """Two steps in the first row, from its second cell to the right; the third cell twice."""
+    scene = GridworldTask(4, 3).scene(torch.tensor([[0, 1], [0, 2], [0, 2]]))
+    discs = [frame[0] for frame in scene.frames]
+    assert [disc.centre for disc in discs if isinstance(disc, Disc)] == [(1, 0), (2, 0), (2, 0)]
+    cells = [shape for shape in scene.still if isinstance(shape, Patch)]
+    shades = {middle_of(cell): int(cell.colour[1:], 16) for cell in cells}
+    assert set(shades) == {(column, -row) for row in range(4) for column in range(4)}
+    assert shades[2, 0] < shades[1, 0] < shades[0, 0]  # there twice, once and never
+    assert len(set(shades.values())) == 3
+
+
+def middle_of(cell: Patch) -> tuple[int, int]:
+    across, up = zip(*cell.points, strict=True)
+    return round(sum(across) / 4), round(sum(up) / 4)

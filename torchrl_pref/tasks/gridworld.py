@@ -17,6 +17,7 @@ from torchrl.envs import EnvBase
 from torchrl_pref.errors import check_count
 from torchrl_pref.pool import QueryPool
 from torchrl_pref.tasks.base import Task, make_pool
+from torchrl_pref.tasks.scene import Disc, Line, Patch, Scene, Shape
 
 MOVES = ((-1, 0), (1, 0), (0, -1), (0, 1))
 """Change of (row, column) for each of the four actions: up, down, left, right."""
@@ -159,6 +160,35 @@ class GridworldTask(Task):
     def features(self, trajectories: Tensor) -> Tensor:
         """See :meth:`Task.features`: (… 4), mean distances in cells."""
         return corner_distances(trajectories, self.size)
+
+    def scene(self, trajectory: Tensor) -> Scene:
+        """See :meth:`Task.scene`: the cells, darker the longer the walk stayed there, its way
+        from a ring at the start, and a disc that goes along it."""
+        cells = [(row, column) for row, column in trajectory.tolist()]
+        longest = max(cells.count(cell) for cell in cells)
+        ground: list[Shape] = []
+        for row in range(self.size):
+            for column in range(self.size):
+                ground.append(square(column, -row, cells.count((row, column)) / longest))
+        way = [(float(column), -float(row)) for row, column in cells]
+        start = (Disc(way[0], 0.34, WAY), Disc(way[0], 0.26, "#ffffff"))
+        frames = tuple((Disc(at, 0.2, WALKER),) for at in way)
+        edge = self.size - 0.5
+        return Scene(
+            (-0.5, -edge), (edge, 0.5), (*ground, *start, Line(tuple(way), WAY, 2.0)), frames
+        )
+
+
+WAY, WALKER = "#33628f", "#d55e00"
+
+
+def square(x: float, y: float, share: float) -> Patch:
+    """A cell, white where the walk never was and the darker the larger its share of the time."""
+    red, green, blue = (round(245 - share * (245 - full)) for full in (140, 185, 222))
+    half = 0.47
+    sides = ((-half, -half), (half, -half), (half, half), (-half, half))
+    points = tuple((x + across, y + up) for across, up in sides)
+    return Patch(points, f"#{red:02x}{green:02x}{blue:02x}")
 
 
 def gridworld_pool(

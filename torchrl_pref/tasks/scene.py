@@ -8,6 +8,7 @@ Shapes: T frames.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -67,7 +68,7 @@ class Scene:
 
     Attributes:
         low, high: corners of what is seen.
-        still: what does not move.
+        still: what does not move; the ground may go on beyond the corners, where it is cut off.
         frames: T, what is seen of each moment beside it, drawn on top.
         equal: whether a unit is as long across as up, as on a map.
     """
@@ -77,3 +78,12 @@ class Scene:
     still: tuple[Shape, ...]
     frames: tuple[tuple[Shape, ...], ...]
     equal: bool = True
+
+
+def corners(scenes: Sequence[Scene]) -> tuple[Point, Point]:
+    """The corners of what is seen of several trajectories, to show them at one scale."""
+    lows, highs = ([scene.low for scene in scenes], [scene.high for scene in scenes])
+    return (
+        (min(x for x, _ in lows), min(y for _, y in lows)),
+        (max(x for x, _ in highs), max(y for _, y in highs)),
+    )

@@ -1,0 +1,224 @@
+"""Scenes as files, and the command that makes a sheet of them."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+
+from torchrl_pref.errors import InputError
+from torchrl_pref.pool import QueryPool
+from torchrl_pref.tasks import TASKS, drawing
+from torchrl_pref.tasks.__main__ import main
+from torchrl_pref.tasks.base import make_pool
+from torchrl_pref.tasks.drawing import save_animation, save_picture
+from torchrl_pref.tasks.gridworld import WALKER, GridworldTask
+from torchrl_pref.tasks.scene import Disc, Label, Line, Patch, Picture, Scene
+from torchrl_pref.tasks.sheet import columns_of, contact_sheet, widened
+
+RED, GREEN, BLUE = "#ff0000", "#00ff00", "#0000ff"
+
+
+def square(left: float, low: float, right: float, high: float, colour: str) -> Patch:
+    return Patch(((left, low), (right, low), (right, high), (left, high)), colour)
+
+
+def moving(count: int = 5, width: float = 2.0) -> Scene:
+    """A red ground, and a blue disc that goes from the left to the right."""
+    ground = square(-9, -9, 9, 9, RED)
+    way = [(0.2 + (width - 0.4) * step / max(1, count - 1), 0.5) for step in range(count)]
+    return Scene((0, 0), (width, 1), (ground,), tuple((Disc(at, 0.15, BLUE),) for at in way))
+
+
+def colour_at(image: Image.Image, x: float, y: float) -> tuple[int, ...]:
+    """At shares of the width from the left and of the height from the top, as plain colours."""
+    place = (round(x * (image.width - 1)), round(y * (image.height - 1)))
+    pixel = image.convert("RGB").getpixel(place)
+    assert isinstance(pixel, tuple)
+    return tuple(round(value / 255) for value in pixel)
+
+
+def test_a_picture_shows_the_last_frame(tmp_path: Path) -> None:
+    save_picture(moving(), tmp_path / "a.png")
+    with Image.open(tmp_path / "a.png") as image:
+        assert colour_at(image, 0.1, 0.5) == (1, 0, 0)
+        assert colour_at(image, 0.88, 0.5) == (0, 0, 1)
+        assert colour_at(image, 0.0, 0.0) == (1, 1, 1)
+
+
+def test_units_are_equal_whatever_the_shape(tmp_path: Path) -> None:
+    for name, low, high in (("wide", (-4, -1), (4, 1)), ("tall", (-1, -4), (1, 4))):
+        scene = Scene(low, high, (square(-0.5, -0.5, 0.5, 0.5, BLUE),), ((),))
+        save_picture(scene, tmp_path / f"{name}.png")
+        with Image.open(tmp_path / f"{name}.png") as image:
+            red = image.convert("RGB").getchannel("R").point(lambda value: 255 * (value < 127))
+            left, top, right, bottom = red.getbbox() or (0, 0, 0, 0)
+            assert abs((right - left) - (bottom - top)) <= 2
+
+
+def test_every_shape_is_drawn_in_its_order(tmp_path: Path) -> None:
+    Image.new("RGB", (4, 4), GREEN).save(tmp_path / "green.gif")
+    for shape, colour in (
+        (square(0, 0, 2, 1, BLUE), (0, 0, 1)),
+        (Line(((0, 0.5), (2, 0.5)), BLUE, 20.0), (0, 0, 1)),
+        (Disc((1, 0.5), 0.3, BLUE), (0, 0, 1)),
+        (Picture(str(tmp_path / "green.gif")), (0, 1, 0)),
+    ):
+        ground = square(0, 0, 2, 1, RED)
+        for name, still, frame, expected in (
+            ("above", (ground,), (shape,), colour),
+            ("below", (shape, ground), (), (1, 0, 0)),
+        ):
+            save_picture(Scene((0, 0), (2, 1), still, (frame,)), tmp_path / f"{name}.png")
+            with Image.open(tmp_path / f"{name}.png") as image:
+                assert colour_at(image, 0.5, 0.5) == expected
+
+
+def test_svg_holds_the_words_and_is_the_same_again(tmp_path: Path) -> None:
+    scene = Scene((0, 0), (2, 1), (Label((1, 0.5), "Zebra"),), ((),))
+    save_picture(scene, tmp_path / "a.svg")
+    text = (tmp_path / "a.svg").read_text()
+    assert text.startswith("<?xml")
+    assert "Zebra" in text
+    assert not re.search(r"<dc:date>", text)
+
+
+def test_an_animation_moves_and_begins_again(tmp_path: Path) -> None:
+    save_animation([moving(), moving(3)], tmp_path / "a.gif")
+    with Image.open(tmp_path / "a.gif") as image:
+        assert image.n_frames == 5
+        assert image.info["loop"] == 0
+        assert colour_at(image, 0.08, 0.55) == (0, 0, 1)
+        assert colour_at(image, 0.45, 0.55) == (1, 0, 0)
+        image.seek(4)
+        assert colour_at(image, 0.08, 0.55) == (1, 0, 0)
+        assert colour_at(image, 0.45, 0.55) == (0, 0, 1)
+        assert colour_at(image, 0.94, 0.55) == (0, 0, 1)  # the shorter one waits at its end
+
+
+@pytest.mark.parametrize("frames", [1, 2, 60, 61, 200])
+def test_an_animation_has_at_most_60_frames(tmp_path: Path, frames: int) -> None:
+    thin = moving(frames, width=8.0)
+    save_animation(thin, tmp_path / "a.gif")
+    with Image.open(tmp_path / "a.gif") as image:
+        assert image.n_frames == min(frames, 60)
+
+
+def test_files_are_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    save_picture(moving(), tmp_path / "a.png")
+    before = (tmp_path / "a.png").read_bytes()
+
+    def fails(*_: object) -> None:
+        raise RuntimeError("in the middle of it")
+
+    monkeypatch.setattr(drawing, "draw", fails)
+    with pytest.raises(RuntimeError):
+        save_picture(moving(), tmp_path / "a.png")
+    with pytest.raises(RuntimeError):
+        save_animation(moving(), tmp_path / "a.gif")
+    assert os.listdir(tmp_path) == ["a.png"]
+    assert (tmp_path / "a.png").read_bytes() == before
+
+
+def test_what_cannot_be_drawn_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "bad.png").write_bytes(b"\x89PNG\r\n\x1a\n and no more")
+    bad = Scene((0, 0), (1, 1), (Picture(str(tmp_path / "bad.png")),), ((),))
+    gone = Scene((0, 0), (1, 1), (Picture(str(tmp_path / "gone.png")),), ((),))
+    for scenes, name, message in (
+        (moving(), "a.bmp", "expected a name that ends in .png or .svg"),
+        (moving(), "no/folder/a.png", "cannot be written"),
+        ([], "a.png", "0 trajectories: expected 1 to 8"),
+        ([moving()] * 9, "a.png", "9 trajectories"),
+        (bad, "a.png", "bad.png: cannot be shown"),
+        (gone, "a.png", "gone.png: cannot be shown"),
+    ):
+        with pytest.raises(InputError, match=re.escape(message)) as caught:
+            save_picture(scenes, tmp_path / name)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(InputError, match=r"ends in \.gif"):
+        save_animation(moving(), tmp_path / "a.png")
+    assert os.listdir(tmp_path) == ["bad.png"]
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_a_sheet_shows_every_query(name: str, tmp_path: Path) -> None:
+    task = TASKS[name]()
+    contact_sheet(task, make_pool(task, 3, 2, 0), tmp_path / "sheet.svg")
+    text = (tmp_path / "sheet.svg").read_text()
+    for word in ("A", "B", "1", "2", "3", *task.feature_names):
+        shown = len(re.findall(rf"<!-- {re.escape(word)} -->|>{re.escape(word)}</text>", text))
+        assert shown >= (1 if word.isdigit() else 3), word
+
+
+def test_a_sheet_shows_where_trajectories_end(tmp_path: Path) -> None:
+    task = GridworldTask(3, 4)
+    contact_sheet(task, make_pool(task, 5, 3, 0), tmp_path / "sheet.svg")
+    assert (tmp_path / "sheet.svg").read_text().count(f"fill: {WALKER}") == 15
+
+
+def test_a_sheet_refuses_what_it_cannot_show(tmp_path: Path) -> None:
+    task = GridworldTask()
+    pool = make_pool(task, 61, 2, 0)
+    with pytest.raises(InputError, match="61 queries of 2 options: expected at most 60"):
+        contact_sheet(task, pool, tmp_path / "a.png")
+    with pytest.raises(InputError, match="2 queries of 9 options"):
+        contact_sheet(task, make_pool(task, 2, 9, 0), tmp_path / "a.png")
+    with pytest.raises(InputError, match="without trajectories"):
+        contact_sheet(task, QueryPool(torch.rand(2, 2, 4)), tmp_path / "a.png")
+
+
+def test_a_grid_is_filled() -> None:
+    assert columns_of(6, 1.0) == 3
+    assert columns_of(1, 3.0) == 1
+    assert columns_of(4, 0.5) in (2, 4)
+    assert widened(((0, 0), (1, 1)), 2.0) == ((0, -0.5), (1, 1.5))
+    assert widened(((0, 0), (1, 1)), 0.5) == ((-0.5, 0), (1.5, 1))
+
+
+def test_the_command_draws_any_task(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sheet = tmp_path / "sheet.png"
+    main(["gridworld", "size=3", "length=4", "--queries", "2", "--animate", "--out", str(sheet)])
+    assert capsys.readouterr().out.split() == [str(sheet), str(tmp_path / "sheet.gif")]
+    with Image.open(tmp_path / "sheet.gif") as image:
+        assert image.n_frames == 4
+    before = sheet.read_bytes()
+    main(["gridworld", "size=3", "length=4", "--queries", "2", "--out", str(sheet)])
+    assert sheet.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["grid"], "expected one of gridworld, driver"),
+        (["gridworld", "width=3"], "width=3: no setting of gridworld; expected size=…, length=…"),
+        (["driver", "size=3"], "no setting of driver; expected none"),
+        (["gridworld", "size"], "no setting of gridworld"),
+        (["gridworld", "size=1"], "size=1: expected a whole number of at least 2"),
+        (["lds", "released_inputs=maybe"], "expected true or false"),
+        (["driver", "--queries", "0"], "--queries=0: expected"),
+        (["driver", "--queries", "99"], "99 queries"),
+        (["driver", "--seed", "-1"], "--seed=-1: expected"),
+        (["driver", "--out", "x.bmp"], "ends in .png or .svg"),
+    ],
+)
+def test_what_is_typed_wrong_is_said_in_one_line(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    assert caught.value.code == 2
+    errors = capsys.readouterr().err
+    assert message in errors
+    assert errors.count("\n") == 1
+
+
+def test_help_tells_the_tasks_and_their_settings(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    told = capsys.readouterr().out
+    for word in (*TASKS, "size=8", "released_inputs=false", "--animate"):
+        assert word in told

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeAlias
 
+from matplotlib import rc_context
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -110,8 +111,10 @@ def checked(path: str | Path, *endings: str) -> Path:
 def save_figure(figure: Figure, path: Path) -> None:
     """Write a figure, by the ending of the file."""
     kind, file = path.suffix.lower().removeprefix("."), io.BytesIO()
-    date = {"Date": None} if kind == "svg" else None  # the same picture, the same file
-    figure.savefig(file, format=kind, metadata=date)
+    # Neither the time nor names drawn by chance: the same picture is the same file.
+    date = {"Date": None} if kind == "svg" else None
+    with rc_context({"svg.hashsalt": "scene"}):
+        figure.savefig(file, format=kind, metadata=date)
     write(path, file)
 
 

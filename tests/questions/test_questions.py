@@ -24,7 +24,7 @@ from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.questions.responses import Boltzmann, Optimal
 from torchrl_pref.questions.weak import Weak
 
-OPTIONS = {"choice": (2, 3, 5), "weak": (2,)}
+OPTIONS = {"choice": (2, 3, 5), "weak": (2,), "ranking": (3,), "best_worst": (4,), "approve": (1,)}
 """About how many options each kind is tried."""
 
 CASES = [

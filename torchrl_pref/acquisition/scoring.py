@@ -22,7 +22,8 @@ from torchrl_pref.questions.response_model import Prediction, ResponseModel
 from torchrl_pref.questions.responses import compiled_constants
 
 CHUNK = 100_000
-"""Returns (B c M K-1) held at once while candidates are scored: bounds memory, fits the cache."""
+"""Probabilities (B c M R-1) held at once while candidates are scored: bounds memory, fits the
+cache."""
 
 
 def predict_answers(samples: Tensor, queries: Tensor, response_model: ResponseModel) -> Prediction:
@@ -33,6 +34,9 @@ def predict_answers(samples: Tensor, queries: Tensor, response_model: ResponseMo
         queries: (B C K D), the candidates.
         response_model: how the belief thinks the human answers.
     """
+    if queries.shape[2] == 1:  # no other to lead over
+        returns = queries.flatten(1, 2) @ samples.mT
+        return response_model.predict_of_returns(returns.unsqueeze(-1))
     leads = queries[..., :-1, :] - queries[..., -1:, :]
     # M is the innermost axis in memory, as the sums over it are the bulk of the work.
     returns = (leads.flatten(1, 2) @ samples.mT).unflatten(1, leads.shape[1:3])
@@ -106,7 +110,8 @@ def score_in_tensors(
     It goes in chunks, so that memory stays bounded whatever B, C and M are.
     """
     sessions, candidates = queries.shape[:2]
-    fits = max(1, CHUNK // (samples.shape[1] * (queries.shape[2] - 1)))
+    n_answers = response_model.n_answers(queries.shape[2])
+    fits = max(1, CHUNK // (samples.shape[1] * (n_answers - 1)))
     step = min(fits, candidates)
     group = max(1, fits // step)
     rows = []

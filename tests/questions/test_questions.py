@@ -103,7 +103,7 @@ def test_the_posterior_is_that_of_the_probabilities(
     """Of every answer once and one more surprise, by quadrature over the probabilities alone."""
     n_answers = model.n_answers(n_options)
     queries = torch.randn(n_answers + 1, n_options, 3, generator=generator)
-    answers = torch.tensor([*range(n_answers), 0])
+    answers = torch.tensor([*range(min(n_answers, 5)), 0])
     if isinstance(model, Boltzmann) and in_tensors:
         model = InTensors(model)
     points = quadrature()

@@ -18,6 +18,7 @@ from torchrl_pref.acquisition.functions import (
     volume_removal,
 )
 from torchrl_pref.acquisition.scoring_cpu import compiled_scores
+from torchrl_pref.acquisition.scoring_table_cpu import compiled_table_scores
 from torchrl_pref.questions.response_model import Prediction, ResponseModel
 from torchrl_pref.questions.responses import compiled_constants
 
@@ -44,7 +45,7 @@ def predict_answers(samples: Tensor, queries: Tensor, response_model: ResponseMo
 
 
 COMPILED: tuple[Acquisition, ...] = (information_gain, alignment_gain, volume_removal)
-"""What ``scoring_cpu.compiled_scores`` knows, in its order."""
+"""What the compiled loops know, in their order."""
 
 
 @dataclass(frozen=True)
@@ -82,10 +83,14 @@ def score_queries(
     """
     constants = compiled_constants(response_model)
     functions = acquisition.functions if isinstance(acquisition, Together) else (acquisition,)
-    known = response_model.is_plain and all(each in COMPILED for each in functions)
+    known = not response_model.lapse and all(each in COMPILED for each in functions)
     if constants is None or not known or not (_is_plain(samples) and _is_plain(queries)):
         return score_in_tensors(samples, queries, response_model, acquisition)
-    scores = compiled_scores(samples, queries, *constants)
+    if response_model.is_plain:
+        scores = compiled_scores(samples, queries, *constants)
+    else:
+        tables = response_model.tables(queries.shape[2], queries.device)
+        scores = compiled_table_scores(samples, queries, *tables, response_model.scale, *constants)
     if not isinstance(acquisition, Together):
         return scores[..., COMPILED.index(acquisition)]
     if functions == COMPILED:

@@ -138,10 +138,10 @@ def answers_on(question: Question, n_options: int, device: torch.device) -> Answ
 def factors_on(question: Question, n_options: int, device: torch.device) -> Factors:
     """The different factors of a question's answers, on a device, in the order of the answers."""
     _, contrasts, offsets, _ = answers_on(question, n_options, torch.device("cpu"))
-    number: dict[bytes, int] = {}
+    number: dict[tuple[bytes, ...], int] = {}
     places, of_answer = [], []
     for place, factor in enumerate(torch.cat([contrasts, offsets.unsqueeze(-1)], -1).flatten(0, 1)):
-        key = factor.numpy().tobytes()
+        key = tuple(sorted(row.tobytes() for row in factor.numpy()))  # rows are in no order
         if key not in number:
             number[key] = len(number)
             places.append(place)

@@ -16,6 +16,7 @@ from torch import Tensor
 from torchrl_pref.questions.base import (
     Answers,
     Evidence,
+    Factors,
     Question,
     answers_on,
     factors_on,
@@ -156,8 +157,7 @@ class ResponseModel(ABC):
             (… R), natural logarithm; each row's exponentials sum to one.
         """
         n_options, device = returns.shape[-1], returns.device
-        log_weights = self._answers(n_options, device).log_weights
-        contrasts, offsets, of_answer = factors_on(self.question, n_options, device)
+        (contrasts, offsets, of_answer), log_weights = self.tables(n_options, device)
         rows = (returns @ contrasts.flatten(0, 1).mT.to(returns)).unflatten(-1, offsets.shape)
         # Answers outermost in memory: what follows reduces over samples, one answer at a time.
         factors = self.log_likelihood(rows + offsets / self.scale).movedim(-1, 0).contiguous()
@@ -192,6 +192,11 @@ class ResponseModel(ABC):
         # The clamp keeps 0 · log 0 from being NaN; it changes no product that float32 can hold.
         entropy = -(probs * log_probs.clamp(min=-1e4)).mean(-2).sum(-1)
         return Prediction(probs, entropy)
+
+    def tables(self, n_options: int, device: torch.device) -> tuple[Factors, Tensor]:
+        """The factors of the answers to a query of K options, and their log-weights (R)."""
+        log_weights = self._answers(n_options, device).log_weights
+        return factors_on(self.question, n_options, device), log_weights
 
     def _answers(self, n_options: int, device: torch.device) -> Answers:
         return answers_on(self.question, n_options, device)

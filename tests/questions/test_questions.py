@@ -100,10 +100,10 @@ def quadrature() -> Tensor:
 def test_the_posterior_is_that_of_the_probabilities(
     model: ResponseModel, n_options: int, in_tensors: bool, generator: Generator
 ) -> None:
-    """Of every answer once and one more surprise, by quadrature over the probabilities alone."""
+    """Of five answers once each and one more surprise, by quadrature over probabilities alone."""
     n_answers = model.n_answers(n_options)
-    queries = torch.randn(n_answers + 1, n_options, 3, generator=generator)
     answers = torch.tensor([*range(min(n_answers, 5)), 0])
+    queries = torch.randn(len(answers), n_options, 3, generator=generator)
     if isinstance(model, Boltzmann) and in_tensors:
         model = InTensors(model)
     points = quadrature()

@@ -30,10 +30,6 @@ HALF: Any = np.float32(0.5)
 FAR: Any = np.float32(87)
 """exp(-87) is the smallest that float32 holds in full."""
 
-NEVER: Any = np.float32(1e-18)
-"""Probabilities below it count as none: so small are the numbers that float32 no longer holds in
-full, with which a processor is slow, that products of two do not come near them."""
-
 # As in ``scoring_cpu``: a compiled function calls only those of its own file.
 PER_BIT: Any = np.float32(-1 / math.log(2))
 POWERS: Any = tuple(np.float32(math.log(2) ** i / math.factorial(i)) for i in range(7))
@@ -183,8 +179,7 @@ def _factor(
                 highest[m] = max(highest[m], -gaps[m])
     for m in range(len(gaps)):
         logs[m] = -highest[m] - _log(likely[m])
-        alone = _exp_minus(min(highest[m], FAR)) / likely[m]
-        likely[m] = alone if alone > NEVER else ZERO
+        likely[m] = _exp_minus(min(highest[m], FAR)) / likely[m]
 
 
 @compiled
@@ -253,10 +248,9 @@ def _gains(
 
 @compiled
 def _multiply(first: Array, second: Array, product: Array) -> None:
-    """Fill the product (M) of two (M), each a probability."""
+    """Fill the product (M) of two (M)."""
     for m in range(len(product)):
-        both = first[m] * second[m]
-        product[m] = both if both > NEVER else ZERO
+        product[m] = first[m] * second[m]
 
 
 @compiled

@@ -99,3 +99,41 @@ class FeedSession(Session):
     @property
     def truncated(self) -> bool:
         return not self.done and self.n_offered == len(self.offers)
+
+
+def chance(label: str, returns: Array, tau: float | None, threshold: float = 0.0) -> Array:
+    """How likely an answer of this label is, (N), from the returns (N K) of the options.
+
+    It is told by its label alone: option 2; B > A > C; best A, worst C; no, yes; the first, the
+    second, about equal.
+    """
+    letters = [ord(word) - ord("A") for word in label.replace(",", "").split() if word.isupper()]
+    if label in ("no", "yes"):
+        logit = returns[:, 0] * (1e9 if tau is None else tau) - threshold
+        return 1 / (1 + np.exp(np.clip(-logit if label == "yes" else logit, -700, 700)))
+    if label in ("the first", "the second", "about equal"):
+        logit = np.clip(tau * (returns[:, 0] - returns[:, 1]), -300, 300)
+        first, second = (1 / (1 + np.exp(threshold - way * logit)) for way in (1, -1))
+        equal = (math.exp(2 * threshold) - 1) * first * second
+        return {"the first": first, "the second": second, "about equal": equal}[label]
+    if label.startswith("option"):
+        return _picks(returns, int(label.split()[1]) - 1, tau)
+    if label.startswith("best"):
+        best, worst = letters
+        others = [k for k in range(returns.shape[1]) if k != best]
+        worse = _picks(-returns[:, others], others.index(worst), tau)
+        return _picks(returns, best, tau) * worse
+    likely = np.ones(len(returns))
+    for place in range(len(letters) - 1):
+        likely *= _picks(returns[:, letters[place:]], 0, tau)
+    return likely
+
+
+def _picks(returns: Array, one: int, tau: float | None) -> Array:
+    """(N), how likely one of the options with returns (N K) is picked."""
+    best = returns.max(1, keepdims=True)
+    if tau is None:
+        weights = np.isclose(returns, best, atol=1e-6, rtol=0).astype(float)
+    else:
+        weights = np.exp(tau * (returns - best))
+    return weights[:, one] / weights.sum(1)

@@ -17,7 +17,7 @@ SMALL = [
 
 JOBS = {
     "task": ["task=my_task:Table", "task.steps=12"],
-    "question": ["question=my_question:Ranking", "pool.options=3"],
+    "question": ["question=my_question:Worst", "pool.options=3"],
     "belief": ["belief=my_belief:Weighted", "belief.draws=500"],
     "human": ["human=my_human:Tiring", "human.patience=5"],
     "policy": ["setup=query", "policy=my_policy:perceptron", "policy.width=8"],

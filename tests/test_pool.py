@@ -84,7 +84,7 @@ def test_features_that_are_not_finite_are_refused(bad: float) -> None:
         QueryPool(features)
 
 
-@pytest.mark.parametrize("shape", [(10, 3), (10, 1, 3), (0, 2, 3), (10, 2, 1), (2, 2, 2, 2)])
+@pytest.mark.parametrize("shape", [(10, 3), (10, 0, 3), (0, 2, 3), (10, 2, 1), (2, 2, 2, 2)])
 def test_shapes_that_do_not_fit_are_refused(shape: tuple[int, ...]) -> None:
     with pytest.raises(InputError, match=r"features of shape .*expected \(N queries"):
         QueryPool(torch.rand(shape))
@@ -96,7 +96,7 @@ def test_trajectories_must_belong_to_the_features() -> None:
 
 
 @pytest.mark.parametrize(
-    "options", [{"n_queries": 0}, {"n_options": 1}, {"size": 1}, {"length": 0}]
+    "options", [{"n_queries": 0}, {"n_options": 0}, {"size": 1}, {"length": 0}]
 )
 def test_numbers_below_their_minimum_are_refused(options: dict[str, int]) -> None:
     with pytest.raises(InputError, match="expected a whole number of at least"):

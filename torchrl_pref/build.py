@@ -91,6 +91,8 @@ def check_groups(settings: Settings) -> None:
         for section in ("human", "belief"):
             lapse = settings[section]["lapse"]
             model = model_of(number, question, lapse)
+            if n_options is not None:
+                model.n_answers(n_options)  # or it is refused here
             make(section, settings[section], model, without=("lapse",))
     if settings.get("policy", {}).get("name", "pretrained") != "pretrained":
         find("policy", settings["policy"])
@@ -185,10 +187,10 @@ def make_task(
     if settings is None:
         return Problem(train, test, normalizer, solved)
     question = make("question", settings["question"])
-    question.answers(train.n_options)  # or it is refused here
     lapses = (settings[section]["lapse"] for section in ("human", "belief"))
     task = Problem(train, test, normalizer, solved, question, *lapses)
-    _ = task.human_model, task.response_model
+    for model in (task.human_model, task.response_model):
+        model.n_answers(train.n_options)  # or it is refused here
     return task
 
 

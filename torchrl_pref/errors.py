@@ -96,6 +96,18 @@ def check_not_negative(name: str, value: Any) -> float:
     return float(value)
 
 
+def check_between(name: str, value: Any, low: float, high: float) -> float:
+    """Return ``value`` as a float if it is a number from ``low`` to ``high``.
+
+    Raises:
+        InputError: it is not.
+    """
+    number = not isinstance(value, bool) and isinstance(value, (int, float))
+    if not number or not low <= value <= high:
+        raise InputError(f"{name}={value!r}: expected a number from {low:g} to {high:g}")
+    return float(value)
+
+
 def check_share(name: str, value: Any) -> float:
     """Return ``value`` as a float if it is a number from 0 to 1.
 

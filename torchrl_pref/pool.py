@@ -29,7 +29,7 @@ class QueryPool:
         trajectories: (N K T …), what a person would be shown, or None.
 
     Raises:
-        InputError: the features are not (N, K ≥ 2, D ≥ 2) finite numbers, or the trajectories do
+        InputError: the features are not (N, K ≥ 1, D ≥ 2) finite numbers, or the trajectories do
             not belong to them or are of a type that cannot be saved.
     """
 
@@ -130,15 +130,15 @@ def check_features(features: Tensor) -> Tensor:
     """Return the features of a pool as float32: a copy, without gradients.
 
     Raises:
-        InputError: they are no plain real numbers, the shape is not (N, K ≥ 2, D ≥ 2), or a value
+        InputError: they are no plain real numbers, the shape is not (N, K ≥ 1, D ≥ 2), or a value
             is NaN, infinite, or beyond float32.
     """
     check_plain("features", features)
     shape = tuple(features.shape)
-    if features.ndim != 3 or shape[0] < 1 or shape[1] < 2 or shape[2] < 2:
+    if features.ndim != 3 or shape[0] < 1 or shape[1] < 1 or shape[2] < 2:
         raise InputError(
             f"features of shape {shape}: expected (N queries, K options, D features) with N at "
-            "least 1, K at least 2 and D at least 2; reshape them or stack the options of a query"
+            "least 1, K at least 1 and D at least 2; reshape them or stack the options of a query"
         )
     # A copy: what is later written into the tensor that was given is not checked.
     single = features.detach().as_subclass(Tensor).to(torch.float32, copy=True).contiguous()

@@ -28,6 +28,7 @@ from torchrl_pref.errors import (
 )
 from torchrl_pref.humans.simulated import SimulatedHuman
 from torchrl_pref.pool import Normalizer, QueryPool
+from torchrl_pref.questions.base import answers_on
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.saved_session import FORMAT, check_content
 from torchrl_pref.strategies import STRATEGIES, MakeStrategy
@@ -133,6 +134,12 @@ class Session:
         """Answers so far, of each person; one that was refused counts."""
         return len(self._states) - 1
 
+    @property
+    def answers(self) -> tuple[str, ...]:
+        """R, what each answer is called, by the number that :meth:`tell` takes."""
+        model, device = self._env.belief.response_model, torch.device("cpu")
+        return answers_on(model.question, self.pool.n_options, device).labels
+
     @torch.no_grad()
     def ask(self) -> Asked:
         """The question to answer next, the same until it is answered.
@@ -160,8 +167,8 @@ class Session:
         """Let in the answer to the question that :meth:`ask` gave.
 
         Args:
-            answer: its number among the answers that the question has, from 0 on (of a choice: the
-                option), or None where the person would not say; for B people one each.
+            answer: its number among :attr:`answers`, from 0 on (of a choice: the option), or None
+                where the person would not say; for B people one each.
 
         Raises:
             InputError: nothing was asked, or there is no such answer. Nothing has changed then.

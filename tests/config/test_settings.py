@@ -23,6 +23,7 @@ from torchrl_pref.config import checks, memory, sections, settings
 from torchrl_pref.envs import objectives
 from torchrl_pref.errors import InputError, one_line
 from torchrl_pref.policies import attention
+from torchrl_pref.questions import QUESTIONS
 from torchrl_pref.training.algorithms import ALGORITHMS
 from torchrl_pref.training.loggers import LOGGERS
 
@@ -217,3 +218,11 @@ def test_the_estimate_knows_what_the_belief_does_at_once() -> None:
     """The estimate is made before anything heavy is imported, so the numbers stand there again."""
     assert memory.MOVED == belief.MOVED
     assert memory.UNIFORMS == 2 + sampler.MAX_SHRINKS
+
+
+def test_the_estimate_knows_how_many_answers_there_are() -> None:
+    for name, kind in QUESTIONS.items():
+        for n_options in {"weak": (2,), "approve": (1,)}.get(name, (2, 3, 5)):
+            table = kind().answers(n_options)
+            expected = len(table.labels), table.offsets[0].numel()
+            assert memory.sizes_of({"question": {"name": name}}, n_options) == expected

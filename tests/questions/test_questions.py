@@ -24,7 +24,7 @@ from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.questions.responses import Boltzmann, Optimal
 from torchrl_pref.questions.weak import Weak
 
-OPTIONS = {"choice": (2, 3, 5), "weak": (2,)}
+OPTIONS = {"choice": (2, 3, 5), "weak": (2,), "ranking": (3,), "best_worst": (4,), "approve": (1,)}
 """About how many options each kind is tried."""
 
 CASES = [
@@ -100,10 +100,10 @@ def quadrature() -> Tensor:
 def test_the_posterior_is_that_of_the_probabilities(
     model: ResponseModel, n_options: int, in_tensors: bool, generator: Generator
 ) -> None:
-    """Of every answer once and one more surprise, by quadrature over the probabilities alone."""
+    """Of five answers once each and one more surprise, by quadrature over probabilities alone."""
     n_answers = model.n_answers(n_options)
-    queries = torch.randn(n_answers + 1, n_options, 3, generator=generator)
-    answers = torch.tensor([*range(n_answers), 0])
+    answers = torch.tensor([*range(min(n_answers, 5)), 0])
+    queries = torch.randn(len(answers), n_options, 3, generator=generator)
     if isinstance(model, Boltzmann) and in_tensors:
         model = InTensors(model)
     points = quadrature()

@@ -72,10 +72,6 @@ def alignment_gain(predicted: Prediction, samples: Tensor) -> Tensor:
         (… C), from 0 to 1 - ‖E[ω]‖² for unit samples.
     """
     # About the mean: a small gain would drown in the rounding of two squares near 1.
-    centred = (samples - samples.mean(-2, keepdim=True)).mT
-    total = torch.zeros_like(predicted.entropy)
-    for probs in predicted.probs.unbind(-1):
-        # (… D C): with C innermost this product is several times as fast as with D.
-        moved = centred @ probs.mT / samples.shape[-2]
-        total += moved.square().sum(-2) / probs.mean(-1).clamp(min=1e-30)
-    return total
+    centred = samples - samples.mean(-2, keepdim=True)
+    moved = torch.einsum("...md,...cmr->...cdr", centred, predicted.probs) / samples.shape[-2]
+    return (moved.square().sum(-2) / predicted.probs.mean(-2).clamp(min=1e-30)).sum(-1)

@@ -18,11 +18,13 @@ from torchrl_pref.acquisition.functions import (
     volume_removal,
 )
 from torchrl_pref.acquisition.scoring_cpu import compiled_scores
+from torchrl_pref.acquisition.scoring_table_cpu import compiled_table_scores
 from torchrl_pref.questions.response_model import Prediction, ResponseModel
 from torchrl_pref.questions.responses import compiled_constants
 
 CHUNK = 100_000
-"""Returns (B c M K-1) held at once while candidates are scored: bounds memory, fits the cache."""
+"""Probabilities (B c M R-1) held at once while candidates are scored: bounds memory, fits the
+cache."""
 
 
 def predict_answers(samples: Tensor, queries: Tensor, response_model: ResponseModel) -> Prediction:
@@ -33,6 +35,9 @@ def predict_answers(samples: Tensor, queries: Tensor, response_model: ResponseMo
         queries: (B C K D), the candidates.
         response_model: how the belief thinks the human answers.
     """
+    if queries.shape[2] == 1:  # no other to lead over
+        returns = queries.flatten(1, 2) @ samples.mT
+        return response_model.predict_of_returns(returns.unsqueeze(-1))
     leads = queries[..., :-1, :] - queries[..., -1:, :]
     # M is the innermost axis in memory, as the sums over it are the bulk of the work.
     returns = (leads.flatten(1, 2) @ samples.mT).unflatten(1, leads.shape[1:3])
@@ -40,7 +45,7 @@ def predict_answers(samples: Tensor, queries: Tensor, response_model: ResponseMo
 
 
 COMPILED: tuple[Acquisition, ...] = (information_gain, alignment_gain, volume_removal)
-"""What ``scoring_cpu.compiled_scores`` knows, in its order."""
+"""What the compiled loops know, in their order."""
 
 
 @dataclass(frozen=True)
@@ -78,10 +83,14 @@ def score_queries(
     """
     constants = compiled_constants(response_model)
     functions = acquisition.functions if isinstance(acquisition, Together) else (acquisition,)
-    known = response_model.is_plain and all(each in COMPILED for each in functions)
+    known = not response_model.lapse and all(each in COMPILED for each in functions)
     if constants is None or not known or not (_is_plain(samples) and _is_plain(queries)):
         return score_in_tensors(samples, queries, response_model, acquisition)
-    scores = compiled_scores(samples, queries, *constants)
+    if response_model.is_plain:
+        scores = compiled_scores(samples, queries, *constants)
+    else:
+        tables = response_model.tables(queries.shape[2], queries.device)
+        scores = compiled_table_scores(samples, queries, *tables, response_model.scale, *constants)
     if not isinstance(acquisition, Together):
         return scores[..., COMPILED.index(acquisition)]
     if functions == COMPILED:
@@ -106,7 +115,8 @@ def score_in_tensors(
     It goes in chunks, so that memory stays bounded whatever B, C and M are.
     """
     sessions, candidates = queries.shape[:2]
-    fits = max(1, CHUNK // (samples.shape[1] * (queries.shape[2] - 1)))
+    n_answers = response_model.n_answers(queries.shape[2])
+    fits = max(1, CHUNK // (samples.shape[1] * (n_answers - 1)))
     step = min(fits, candidates)
     group = max(1, fits // step)
     rows = []

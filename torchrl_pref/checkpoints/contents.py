@@ -91,7 +91,7 @@ def check_content(content: dict[str, Any]) -> None:
     _check_settings(content["settings"])
     shape = content["pool_shape"]
     _check_types("pool_shape", shape, dict.fromkeys("NKD", WHOLE))
-    _expect(shape["N"] >= 1 and shape["K"] >= 2 and shape["D"] >= 2, "pool_shape", "real sizes")
+    _expect(shape["N"] >= 1 and shape["K"] >= 1 and shape["D"] >= 2, "pool_shape", "real sizes")
     tau = content["tau"]
     fits = type(tau) in NUMBER and math.isfinite(tau) and tau > 0
     _expect(tau is None or fits, "tau", "None or a finite number above 0")

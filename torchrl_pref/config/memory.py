@@ -8,8 +8,9 @@ enough to tell what fits from what does not.
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,6 +31,16 @@ UNIFORMS = 18
 
 LIMIT_FILES = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 """Where Linux writes what a container may use."""
+
+
+SIZES: dict[str, Callable[[int], tuple[int, int]]] = {
+    "weak": lambda n_options: (3, 2),
+    "ranking": lambda n_options: (math.factorial(min(n_options, 6)), (n_options - 1) ** 2),
+    "best_worst": lambda n_options: (n_options * (n_options - 1), 2 * (n_options - 1)),
+    "approve": lambda n_options: (2, 1),
+}
+"""From K to the number of answers R and the rows of each, by kind of question; of the others they
+are those of a choice, K and K-1."""
 
 
 class Part(NamedTuple):
@@ -78,7 +89,8 @@ def parts_of(settings: Settings, *pool_shape: int) -> Iterator[Part]:
         steps = settings["training"]["steps"] or offers or budget
         frames = settings["training"]["sessions"] * steps
         kept = 36.0 * samples * n_features
-        kept += 5.0 * (budget * (16 + 4 * n_options) + 8 * offers + 100)
+        n_answers, _ = sizes_of(settings, n_options)
+        kept += 5.0 * (budget * (16 + 4 * n_answers) + 8 * offers + 100)
         kept += _shown(settings, n_queries, n_options, n_features)
         own = "setup.offers" if setup["name"] == "feed" else "setup.candidates"
         keys = ("training.sessions", "training.steps", *beliefs, *sizes, own)
@@ -91,6 +103,12 @@ def parts_of(settings: Settings, *pool_shape: int) -> Iterator[Part]:
     counts = "evaluation.humans" if settings.get("protocol") is None else "workers"
     yield Part("the evaluation", humans * each, (counts, *beliefs, *sizes))
     yield from _belief_parts(settings, n_options, n_features)
+
+
+def sizes_of(settings: Settings, n_options: int) -> tuple[int, int]:
+    """How many answers there are, and how many rows each has."""
+    size = SIZES.get(settings["question"]["name"])
+    return (n_options, n_options - 1) if size is None else size(n_options)
 
 
 def _shown(settings: Settings, n_queries: int, n_options: int, n_features: int) -> float:
@@ -124,8 +142,9 @@ def _belief_parts(settings: Settings, n_options: int, n_features: int) -> Iterat
     at_once = max(samples, min(sessions * samples, MOVED // moves))
     directions = 4.0 * (UNIFORMS * moves + 4 * n_features) * at_once
     yield Part("moving the belief", directions, ("belief.samples", "belief.moves"))
-    answers = 8.0 * budget * (n_options - 1) * at_once
-    answers += 8.0 * n_options * n_options * samples
+    n_answers, n_rows = sizes_of(settings, n_options)
+    answers = 8.0 * budget * n_rows * at_once
+    answers += 8.0 * n_options * n_answers * samples
     keys = ("belief.samples", "setup.budget", "pool.options")
     yield Part("the likelihood of the answers", answers, keys)
     if settings["objective"] == "entropy":

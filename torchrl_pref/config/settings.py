@@ -47,7 +47,7 @@ TASK: dict[str, Check] = {
     "device": check_device,
     "threads": count(1, LARGEST_THREADS),
     "pool.size": count(1),
-    "pool.options": count(2),
+    "pool.options": count(1),
     "pool.seed": count(0, 2**29 - 1),  # a pool takes two seeds below 2**31, and there are two
     "pool.train": optional(check_path),
     "pool.test": optional(check_path),
@@ -132,6 +132,9 @@ OTHERS: dict[str, dict[str, dict[str, Check]]] = {
     "belief": {"sampled": {"belief.samples": count(2), "belief.moves": optional(count(1))}},
 }
 """Of the other groups. What is not in here is checked by what is made of it: ``open_groups``."""
+
+OF_ONE = ("approve", "own")
+"""Kinds of question that may be about one option."""
 
 PRETRAINED: dict[str, dict[str, Check]] = {"pretrained": {}}
 """The policies that evaluate.py can be asked for by name."""
@@ -283,6 +286,8 @@ def _check_together(settings: Plain) -> None:
             f"pool.{given[0]}={pool[given[0]]} alone: the other pool would be the task's; "
             "expected both pool.train and pool.test of your own, or neither"
         )
+    if settings["question"]["name"] not in OF_ONE:
+        check_count("pool.options", pool["options"], 2)
     budget = setup["budget"]
     if setup["name"] == "feed":
         if setup["offers"] is not None:

@@ -47,7 +47,8 @@ class HumanBase(ABC):
             turn: (B), how many queries each human has answered before.
 
         Returns:
-            (B) int64, the index of the answer.
+            (B) int64, the index of the answer, or -2 (``envs.transition.REFUSED``) where they
+            would not say.
 
         Raises:
             InputError: the returns are not finite.

@@ -22,6 +22,7 @@ from torchrl_pref.policies.base import (
     _belief_critic,
     _belief_features,
     belief_summary,
+    compared,
 )
 
 WIDTH, HEADS = 32, 4
@@ -69,8 +70,7 @@ class AttentionScorer(nn.Module):
     def forward(self, samples: Tensor, queries: Tensor, shares: Tensor) -> Tensor:
         """From samples (B M D), candidates (B C K D) and shares (B s) to scores (B C)."""
         candidates, options = queries.shape[1:3]
-        centred = queries - queries.mean(-2, keepdim=True)
-        shown = self.option(centred.flatten(1, 2))
+        shown = self.option(compared(queries).flatten(1, 2))
         keys, values = self.point(belief_tokens(samples, self.tokens)).chunk(2, -1)
         split = [part.unflatten(-1, (HEADS, -1)).transpose(1, 2) for part in (shown, keys, values)]
         seen = F.scaled_dot_product_attention(*split).transpose(1, 2).flatten(2)

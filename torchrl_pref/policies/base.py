@@ -99,6 +99,12 @@ class Layer(TensorDictModuleBase):
         return tensordict
 
 
+def compared(queries: Tensor) -> Tensor:
+    """Features of options (… K D) less their mean, so that only differences count; of a single
+    option as they are: it is compared with the average trajectory, whose features are 0."""
+    return queries if queries.shape[-2] == 1 else queries - queries.mean(-2, keepdim=True)
+
+
 def _belief_features(summary: Callable[[Tensor], Tensor]) -> Layer:
     """What the critic reads of the belief."""
     return Layer(

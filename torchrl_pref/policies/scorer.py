@@ -31,6 +31,7 @@ from torchrl_pref.policies.base import (
     _belief_critic,
     _belief_features,
     belief_summary,
+    compared,
 )
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.strategies import OfferRank, asks_over_offers
@@ -72,7 +73,7 @@ class CandidateFeatures(nn.Module):
             self.response_model,
             together(information_gain, alignment_gain, volume_removal),
         ).unbind(-1)
-        centred = queries - queries.mean(-2, keepdim=True)
+        centred = compared(queries)
         variance = ((centred @ covariance.unsqueeze(1)) * centred).sum((-2, -1))
         apart = (centred @ mean[:, None, :, None]).squeeze(-1).norm(dim=-1)
         length = centred.square().sum((-2, -1)).sqrt()

@@ -1,7 +1,7 @@
 """Kinds of question: what can be answered, and what each answer says of ω.
 
-Letters: K options per query, R possible answers, F factors of an answer, J rows of a factor, D
-features, ``…`` any leading dimensions.
+Letters: K options per query, R possible answers, F factors of an answer, J rows of a factor, U
+different factors of a question, D features, ``…`` any leading dimensions.
 
 Every answer is evidence of one form: a product of F softmax choices, in each of which something was
 preferred to J others (reward-rational choice: Jeon, Milli and Dragan, 2020). A row is what the
@@ -79,6 +79,20 @@ class Answers(NamedTuple):
     """(R), natural logarithm of what the product of an answer's factors is multiplied by."""
 
 
+class Factors(NamedTuple):
+    """The different factors that the answers to a query of K options are made of.
+
+    Many answers share them: the 720 orders of six options are made of 186 choices.
+    """
+
+    contrasts: Tensor
+    """(U J K), see :class:`Answers`."""
+    offsets: Tensor
+    """(U J), in logits; infinite where there is no row."""
+    of_answer: Tensor
+    """(R F), which of them make each answer."""
+
+
 class Question(ABC):
     """A kind of question. Two of the same kind with the same numbers are equal.
 
@@ -118,6 +132,23 @@ def answers_on(question: Question, n_options: int, device: torch.device) -> Answ
     _check_answers(question, n_options, answers)
     labels, *tensors = answers
     return Answers(labels, *(tensor.to(device) for tensor in tensors))
+
+
+@lru_cache(maxsize=64)
+def factors_on(question: Question, n_options: int, device: torch.device) -> Factors:
+    """The different factors of a question's answers, on a device, in the order of the answers."""
+    _, contrasts, offsets, _ = answers_on(question, n_options, torch.device("cpu"))
+    number: dict[tuple[bytes, ...], int] = {}
+    places, of_answer = [], []
+    for place, factor in enumerate(torch.cat([contrasts, offsets.unsqueeze(-1)], -1).flatten(0, 1)):
+        key = tuple(sorted(row.tobytes() for row in factor.numpy()))  # rows are in no order
+        if key not in number:
+            number[key] = len(number)
+            places.append(place)
+        of_answer.append(number[key])
+    tensors = contrasts.flatten(0, 1)[places], offsets.flatten(0, 1)[places]
+    index = torch.tensor(of_answer).view(contrasts.shape[:2])
+    return Factors(*(tensor.to(device) for tensor in (*tensors, index)))
 
 
 def _check_answers(question: Question, n_options: int, answers: Answers) -> None:

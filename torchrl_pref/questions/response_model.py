@@ -13,7 +13,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrl_pref.questions.base import Answers, Evidence, Question, answers_on, rows_of
+from torchrl_pref.questions.base import (
+    Answers,
+    Evidence,
+    Factors,
+    Question,
+    answers_on,
+    factors_on,
+    rows_of,
+)
 from torchrl_pref.questions.choice import Choice
 
 
@@ -148,32 +156,47 @@ class ResponseModel(ABC):
         Returns:
             (… R), natural logarithm; each row's exponentials sum to one.
         """
-        table = self._answers(returns.shape[-1], returns.device)
-        log_probs = []
-        for contrasts, offsets, log_weight in zip(*table[1:], strict=True):
-            rows = returns @ contrasts.flatten(0, 1).mT.to(returns)
-            gaps = rows.unflatten(-1, offsets.shape) + offsets / self.scale
-            log_probs.append(self.log_likelihood(gaps).sum(-1) + log_weight)
+        n_options, device = returns.shape[-1], returns.device
+        (contrasts, offsets, of_answer), log_weights = self.tables(n_options, device)
+        rows = (returns @ contrasts.flatten(0, 1).mT.to(returns)).unflatten(-1, offsets.shape)
         # Answers outermost in memory: what follows reduces over samples, one answer at a time.
-        likely = torch.stack(log_probs)
+        factors = self.log_likelihood(rows + offsets / self.scale).movedim(-1, 0).contiguous()
+        likely = factors[of_answer[:, 0]]
+        for factor in of_answer.unbind(1)[1:]:
+            likely += factors[factor]
+        likely += log_weights.view(-1, *(1,) * (likely.ndim - 1)).to(likely)
         if self.lapse:
             at_random = torch.full_like(likely, math.log(self.lapse / len(likely)))
             likely = torch.logaddexp(likely + math.log1p(-self.lapse), at_random)
         return likely.movedim(0, -1)
 
     def predict(self, leads: Tensor) -> Prediction:
-        """What M samples of the weights predict of the answer.
+        """What M samples of the weights predict of the answer to a query of K ≥ 2 options.
 
         Args:
             leads: (… M K-1), by how much the return of each option exceeds that of the last one,
                 under each sample.
         """
         columns = leads.unbind(-1)
-        log_probs = self(torch.stack([*columns, torch.zeros_like(columns[0])]).movedim(0, -1))
+        returns = torch.stack([*columns, torch.zeros_like(columns[0])]).movedim(0, -1)
+        return self.predict_of_returns(returns)
+
+    def predict_of_returns(self, returns: Tensor) -> Prediction:
+        """What M samples of the weights predict of the answer.
+
+        Args:
+            returns: (… M K), of each option under each sample.
+        """
+        log_probs = self(returns)
         probs = log_probs.exp()
         # The clamp keeps 0 · log 0 from being NaN; it changes no product that float32 can hold.
         entropy = -(probs * log_probs.clamp(min=-1e4)).mean(-2).sum(-1)
         return Prediction(probs, entropy)
+
+    def tables(self, n_options: int, device: torch.device) -> tuple[Factors, Tensor]:
+        """The factors of the answers to a query of K options, and their log-weights (R)."""
+        log_weights = self._answers(n_options, device).log_weights
+        return factors_on(self.question, n_options, device), log_weights
 
     def _answers(self, n_options: int, device: torch.device) -> Answers:
         return answers_on(self.question, n_options, device)

@@ -13,6 +13,7 @@ functions, the simulated humans and the calibration of ``tau`` all call it.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Any, final
 
 import torch
@@ -26,7 +27,7 @@ from torchrl_pref.errors import (
     check_share,
     check_type,
 )
-from torchrl_pref.questions.base import Question
+from torchrl_pref.questions.base import Answers, Question, answers_on
 from torchrl_pref.questions.choice import Choice
 from torchrl_pref.questions.response_model import Prediction, ResponseModel
 
@@ -111,6 +112,9 @@ class Optimal(ResponseModel):
         tolerance: gaps this small count as ties. It absorbs the rounding of float32 returns, so a
             belief never excludes the very human who answered. In the units of the return.
         lapse: probability of an answer at random, from 0 to below 1.
+        question: the kind of question; by default a choice of one option. Each factor of an answer
+            is then an argmax. A question about options whose answers have thresholds is refused
+            when it is asked.
 
     Raises:
         InputError: ``tolerance`` is not a finite number of at least zero, or the lapse rate is no
@@ -120,8 +124,11 @@ class Optimal(ResponseModel):
     def __init_subclass__(cls, **_: Any) -> None:
         _refuse_subclass(cls, Optimal)
 
-    def __init__(self, tolerance: float = TOLERANCE, lapse: float = 0.0) -> None:
+    def __init__(
+        self, tolerance: float = TOLERANCE, lapse: float = 0.0, question: Question | None = None
+    ) -> None:
         self.tolerance = check_not_negative("tolerance", tolerance)
+        self.question = _check_question(question)
         self.lapse = _check_lapse(lapse)
 
     @property
@@ -167,6 +174,11 @@ class Optimal(ResponseModel):
         tolerance = "" if self.tolerance == TOLERANCE else f", tolerance={shown(self.tolerance)}"
         return f"Optimal({(tolerance + _beside(self))[2:]})"
 
+    def _answers(self, n_options: int, device: torch.device) -> Answers:
+        table = super()._answers(n_options, device)
+        _check_even(self.question, n_options)
+        return table
+
 
 def _check_question(question: Any) -> Question:
     """A choice where there is none.
@@ -208,16 +220,26 @@ def model_of(tau: float | None, question: Question, lapse: float) -> ResponseMod
     """How someone answers; tau is None for one who never errs.
 
     Raises:
-        InputError: a number is out of range, or there is no such human.
+        InputError: a number is out of range.
     """
-    if tau is not None:
-        return Boltzmann(tau, question, lapse)
-    if question != Choice():
+    return (
+        Optimal(lapse=lapse, question=question) if tau is None else Boltzmann(tau, question, lapse)
+    )
+
+
+@lru_cache(maxsize=64)
+def _check_even(question: Question, n_options: int) -> None:
+    """Refuse to ask what has thresholds of those who never err.
+
+    Raises:
+        InputError: an answer is harder or easier to give than between equals.
+    """
+    _, _, offsets, log_weights = answers_on(question, n_options, torch.device("cpu"))
+    if ((offsets != 0) & offsets.isfinite()).any() or (log_weights != 0).any():
         raise InputError(
-            f"tau=optimal with {question!r}: a human who never errs finds nothing about equal; "
-            "expected question=choice, or another tau"
+            f"tau=optimal with {question!r}: to a human who never errs no threshold counts, and "
+            "nothing is about equal; expected a question without thresholds, or another tau"
         )
-    return Optimal(lapse=lapse)
 
 
 def compiled_constants(response_model: ResponseModel) -> tuple[float, float] | None:

@@ -43,14 +43,14 @@ def make_pool(task: Task, n_queries: int, n_options: int, seed: int) -> QueryPoo
     Args:
         task: where trajectories come from.
         n_queries: N, at least 1.
-        n_options: K, at least 2.
+        n_options: K, at least 1.
         seed: fixes the pool.
 
     Raises:
         InputError: a number is below its minimum, or the features cannot be used.
     """
     check_count("pool.size", n_queries, 1)
-    check_count("pool.options", n_options, 2)
+    check_count("pool.options", n_options, 1)
     trajectories = task.trajectories(n_queries * n_options, seed)
     features = task.features(trajectories)
     shape = (n_queries, n_options)

@@ -198,7 +198,7 @@ def gridworld_pool(
 
     Args:
         n_queries: N, at least 1.
-        n_options: K, at least 2.
+        n_options: K, at least 1.
         size: cells along an edge of the Gridworld.
         length: T, cells in a walk.
         seed: fixes the pool.

@@ -1,7 +1,17 @@
 """Where trajectories come from, and their features."""
 
 from torchrl_pref.tasks.base import Task
+from torchrl_pref.tasks.files import FilesTask
 from torchrl_pref.tasks.gridworld import GridworldTask
+from torchrl_pref.tasks.gymnasium import GymnasiumTask
+from torchrl_pref.tasks.minari import MinariTask
+from torchrl_pref.tasks.torchrl import TorchRLTask
 
-TASKS: dict[str, type[Task]] = {"gridworld": GridworldTask}
+TASKS: dict[str, type[Task]] = {
+    "gridworld": GridworldTask,
+    "gymnasium": GymnasiumTask,
+    "torchrl": TorchRLTask,
+    "files": FilesTask,
+    "minari": MinariTask,
+}
 """The tasks by name."""

@@ -148,6 +148,6 @@ class VectorSimulator(Simulator):
 def _mended(error: Exception) -> str:
     """What an error says, and how what is missing is installed."""
     text = " ".join(str(error).split())[:300]
-    if "Box2D" in text or "box2d" in text:
+    if "box2d" in text.lower():  # of its own packages, too
         return f"{text}; pip install -c constraints.txt -e '.[box2d]'"
     return text

@@ -41,8 +41,7 @@ class MinariTask(RecordedTask):
         if not isinstance(id, str):
             raise InputError(f"id={id!r}: expected a dataset, or its folder; type task.id=…")
         try:
-            folder = Path(id) / "data"
-            data = minari.MinariDataset(folder) if folder.exists() else minari.load_dataset(id)
+            data = minari.MinariDataset(_data_folder(id))
             spec = data.env_spec
             of_env = features_of("the dataset" if spec is None else spec.id, features)
             computed = torch.cat([_features(episode, of_env) for episode in data])
@@ -54,6 +53,26 @@ class MinariTask(RecordedTask):
                 f"{error!s:.300}); expected one on this machine; check the name"
             ) from error
         super().__init__(id, computed, names_of(of_env, computed.shape[-1]))
+
+
+def _data_folder(id: str) -> Path:
+    """Where the data of a dataset are.
+
+    Raises:
+        InputError: they do not say what is observed and done; Minari would then make the
+            environment that they name, by whatever code they name.
+    """
+    from minari.dataset.minari_storage import MinariStorage
+    from minari.storage.datasets_root_dir import get_dataset_path
+
+    folder = (Path(id) if Path(id).is_dir() else get_dataset_path(id)) / "data"
+    metadata = MinariStorage.read_raw_metadata(folder)
+    if not {"observation_space", "action_space"} <= metadata.keys():
+        raise InputError(
+            f"id={id}: the dataset does not say what is observed and done (observation_space and "
+            "action_space), and its code is not run to find out; collect it again"
+        )
+    return folder
 
 
 def _features(episode: Any, features: FeatureMap) -> Tensor:

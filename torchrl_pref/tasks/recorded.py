@@ -21,8 +21,8 @@ Self = TypeVar("Self", bound="RecordedTask")
 class RecordedTask(Task):
     """Trajectories that are there already; in a pool stand their numbers.
 
-    Trajectories on their own are paired: each is in as many queries as another, or in one more, and
-    never twice in one query. Queries that are given stay as they are.
+    Trajectories on their own are put together to queries: each is in about as many as another, and
+    never twice in one. Queries that are given stay as they are.
 
     Args:
         source: what they are of, for messages.

@@ -215,7 +215,10 @@ def keys_of(config: DictConfig) -> set[str]:
 
 
 OPTIONS = {
-    "train": ["setup=query", "policy=attention", "policy=paper", "algorithm=ppo", "question=weak"],
+    "train": [
+        *("setup=query", "policy=attention", "policy=paper", "algorithm=ppo", "question=weak"),
+        *("task=gymnasium", "task=torchrl", "task=files", "task=minari"),
+    ],
     "evaluate": ["setup=query", "question=weak"],
 }
 

@@ -84,11 +84,13 @@ def test_images_are_shown(tmp_path: Path) -> None:
         assert picture == Picture(str(tmp_path / "clips" / f"{number}.png"))
     bare = FilesTask(str(tmp_path / "x.csv"), columns=["lane", "speed"])
     assert bare.feature_names == ("lane", "speed")
+    outside = tmp_path.parent / f"{tmp_path.name}.png"
+    Image.new("RGB", (4, 4)).save(outside)
     for named in (
         "clips/7.png",
         "x.csv",
-        "../../../etc/hostname",
-        "/etc/passwd",
+        f"../{tmp_path.name}.png",
+        str(outside),
         "a\0b",
         "b" * 999,
     ):

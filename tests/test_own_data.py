@@ -98,7 +98,7 @@ def settings_of(task: str, **typed: object) -> dict[str, Any]:
         ("gymnasium", {"policy": "mine:untyped"}, "run only if you type it"),
         ("gymnasium", {"make": "mine:untyped"}, "run only if you type it"),
         ("torchrl", {}, "type task.make="),
-        ("torchrl", {"make": "mine:lean"}, "task.make: the environment cannot be made"),
+        ("torchrl", {"make": "mine:lean"}, "task.make=lean: fails"),
         ("minari", {}, "type task.id="),
         ("minari", {"features": "mine:untyped"}, "run only if you type it"),
         ("files", {}, "type task.path="),

@@ -82,17 +82,19 @@ class TensorDictSimulator(Simulator):
     """
 
     def __init__(self, make: Callable[[], EnvBase], size: int) -> None:
+        name = getattr(make, "__name__", type(make).__name__)
         try:
             env: Any = make()
         except Exception as error:  # whatever it is, it is the user's
             raise InputError(
-                f"make: the environment cannot be made ({type(error).__name__}: {error}); mend it"
+                f"make={name}: fails ({type(error).__name__}: {error}); expected a function "
+                "without arguments that makes an environment; mend it"
             ) from error
         if not isinstance(env, EnvBase) or len(env.batch_size) > 1:
             came = f"of batch size {tuple(env.batch_size)}" if isinstance(env, EnvBase) else ""
             raise InputError(
-                f"make: gives a {type(env).__name__} {came}; expected a TorchRL environment of "
-                "batch size () or (B)"
+                f"make={name}: gives a {type(env).__name__} {came}; expected a TorchRL environment "
+                "of batch size () or (B)"
             )
         self._env = env if len(env.batch_size) else SerialEnv(size, make)
         self.size = self._env.batch_size.numel()

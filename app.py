@@ -110,12 +110,13 @@ class _Unbroken:
 
 def allow_typed(settings: Plain) -> None:
     """Let the code be imported that the user typed, as in ``policy=mine:make``."""
-    typed_by_user = [group for group in typed.GROUPS if typed.was_typed(f"{group}.make")]
+    typed_by_user = typed.typed_code()
     if typed_by_user:
         from torchrl_pref.groups import allow
 
-        for group in typed_by_user:
-            allow(settings[group]["make"])
+        for key in typed_by_user:
+            group, _, name = key.partition(".")
+            allow(str(settings[group][name]))
 
 
 def refuse_other_code(settings: Mapping[str, Any], new: Mapping[str, Any]) -> None:
@@ -128,21 +129,22 @@ def refuse_other_code(settings: Mapping[str, Any], new: Mapping[str, Any]) -> No
     Raises:
         InputError: a group names other code there.
     """
-    for group in typed.GROUPS:
-        if typed.was_typed(f"{group}.make"):
-            there, here = settings[group].get("make"), new[group]["make"]
-            if there != here:
+    for code in typed.typed_code():
+        group, _, name = code.partition(".")
+        shown = group if name == "make" and new[group]["name"] == "own" else code
+        there, here = settings[group].get(name), new[group][name]
+        if there != here:
+            raise InputError(
+                f"{shown}={here}: the run was made with {shown}="
+                f"{there or settings[group]['name']}; type that, or leave {group} out"
+            )
+        for key, value in new[group].items():
+            known = settings[group].get(key)
+            if typed.was_typed(f"{group}.{key}") and value != known:
                 raise InputError(
-                    f"{group}={here}: the run was made with {group}="
-                    f"{there or settings[group]['name']}; type that, or leave {group} out"
+                    f"{group}.{key}={value}: the run was made with {group}.{key}={known}; "
+                    f"leave {group}.{key} out"
                 )
-            for key, value in new[group].items():
-                known = settings[group].get(key)
-                if typed.was_typed(f"{group}.{key}") and value != known:
-                    raise InputError(
-                        f"{group}.{key}={value}: the run was made with {group}.{key}={known}; "
-                        f"leave {group}.{key} out"
-                    )
 
 
 def check_groups(settings: Plain) -> None:

@@ -81,7 +81,7 @@ def check(settings: Plain) -> Settings:
     if settings.get("protocol") is not None:
         typed.refuse_other_overrides("protocol", PROTOCOL_KEYS)
     elif settings.get("checkpoint") is not None:
-        own = tuple(group for group in typed.GROUPS if typed.was_typed(f"{group}.make"))
+        own = tuple(key.partition(".")[0] for key in typed.typed_code())
         if "policy" in settings and "policy" not in own:
             raise InputError(
                 "policy=pretrained and checkpoint=… name two policies; expected one of "

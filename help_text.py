@@ -78,7 +78,7 @@ def _group(group: str, default: str, script: str) -> str:
         meaning = named[0].comment if named else " ".join(_top_comment(path).split())
         mark = " (default)" if path.stem == default else ""
         rows.append(_row(f"{group}={path.stem}", f"{meaning}{mark}"))
-        inner = [key for key in keys if named and key.name not in ("name", "make")]
+        inner = [key for key in keys if named and key.name != "name" and key.value != "???"]
         rows += [_row(f"  {group}.{key.name}={key.value}", key.comment) for key in inner]
     return "\n".join(rows)
 

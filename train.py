@@ -58,7 +58,7 @@ def check(settings: Plain) -> Settings:
     if settings["resume"] is None:
         app.check_groups(settings)
     else:
-        own = tuple(group for group in typed.GROUPS if typed.was_typed(f"{group}.make"))
+        own = tuple(key.partition(".")[0] for key in typed.typed_code())
         allowed = ("training.updates", *OF_THE_MACHINE, "hydra.")
         typed.refuse_other_overrides("resume", allowed, own)
     return checked
@@ -175,6 +175,11 @@ def start(folder: Path, settings: Settings) -> float:
     app.use_threads(settings)
     pools = build.make_pools(settings)
     check_memory(settings, *pools[0].features.shape)
+    if len(pools[0]) < settings["pool"]["size"] and settings["pool"]["train"] is None:
+        print(
+            f"note: {len(pools[0])} queries to train on and {len(pools[1])} to test on; the task "
+            f"has no more, and pool.size={settings['pool']['size']} asks for more"
+        )
     task = build.make_task(*pools, settings["tau"], settings)
     trainer = make_trainer(settings, task)
     comparison.check_evaluation(settings)

@@ -25,6 +25,9 @@ from torchrl_pref.errors import InputError, one_line_errors
 GROUPS = ("policy", "task", "question", "human", "belief")
 """Groups of which ``<group>=<module>:<name>`` chooses something of the user's own."""
 
+CODE = (*(f"{group}.make" for group in GROUPS), "task.features", "task.policy")
+"""Keys that name code of the user's, as ``<module>:<name>``."""
+
 
 class Gate(Callback):
     """Refuses what was typed before Hydra makes a folder for it."""
@@ -179,6 +182,11 @@ def typed_overrides() -> list[str]:
 def was_typed(key: str) -> bool:
     """Whether the user typed a value for a key."""
     return any(override.split("=")[0].lstrip("+") == key for override in typed_overrides())
+
+
+def typed_code() -> list[str]:
+    """The keys by which the user typed what code of theirs may be imported."""
+    return [key for key in CODE if was_typed(key)]
 
 
 def refuse_other_overrides(

@@ -215,7 +215,10 @@ def keys_of(config: DictConfig) -> set[str]:
 
 
 OPTIONS = {
-    "train": ["setup=query", "policy=attention", "policy=paper", "algorithm=ppo", "question=weak"],
+    "train": [
+        *("setup=query", "policy=attention", "policy=paper", "algorithm=ppo", "question=weak"),
+        *("task=gymnasium", "task=torchrl", "task=files", "task=minari"),
+    ],
     "evaluate": ["setup=query", "question=weak"],
 }
 
@@ -282,7 +285,7 @@ BAD_INPUT = [
     ("train", "checkpoint={tmp}/text.pt", "cannot be read as a torchrl_pref checkpoint"),
     ("train", "pool.test={tmp}/plain.pt", "expected both pool.train and pool.test"),
     ("train", "pool.train={tmp}/none.pt pool.test={tmp}/wide.pt", "none.pt: no such file"),
-    ("train", "pool.train={tmp}/constant.pt pool.test={tmp}/plain.pt", "feature 2 never varies"),
+    ("train", "pool.train={tmp}/constant.pt pool.test={tmp}/plain.pt", "feature 3 never varies"),
     ("train", "pool.train={tmp}/plain.pt pool.test={tmp}/three.pt", "pool.test has K=3"),
     ("train", "pool.train={tmp}/plain.pt pool.test={tmp}/wide.pt", "D=5: expected D=4"),
     ("train", "hydra.run.dir={tmp}/text.pt/run", "the run folder cannot be written"),

@@ -121,7 +121,8 @@ NO_SETTINGS = ("actor", "csv", "png", "py", "strategy")
 def known_keys() -> set[str]:
     """Every key that either script has, whatever is chosen."""
     groups = ("setup=query", "setup=feed", "question=weak", "policy=attention", "policy=scorer")
-    typed_here = [("train", one) for one in (*groups, "algorithm=ppo", "task=lds")]
+    tasks = ("task=lds", "task=gymnasium", "task=torchrl", "task=files", "task=minari")
+    typed_here = [("train", one) for one in (*groups, *tasks, "algorithm=ppo")]
     typed_here += [("evaluate", one) for one in groups[:3]]
     keys = set(chain(*(keys_of(OmegaConf.create(composed(*one))) for one in typed_here)))
     return keys | {key.partition(".")[0] for key in keys} | {"experiment"}

@@ -106,7 +106,9 @@ def _try_task(settings: Settings) -> None:
     """
     task = make("task", settings["task"])
     try:
-        make_pool(task, 1, 2, seed=0)
+        make_pool(task, 1, settings["pool"]["options"], seed=0)
+    except InputError:
+        raise
     except Exception as error:
         named = settings["task"].get("make", settings["task"]["name"])
         raise InputError(
@@ -136,19 +138,18 @@ def make_pools(settings: Settings) -> tuple[QueryPool, QueryPool]:
     first_seed = 4 * check_seed("pool.seed", pool["seed"])
     if first_seed >= 2**31:
         raise InputError(f"pool.seed={pool['seed']}: expected a whole number below {2**29}")
-    pools = []
-    for path, seed in ((pool["train"], first_seed), (pool["test"], first_seed + 2)):
-        if path is not None:
-            pools.append(QueryPool.load(str(path)))
-        else:
-            pools.append(draw_pool(settings, seed))
-    return pools[0], pools[1]
+    if given:
+        return QueryPool.load(str(pool["train"])), QueryPool.load(str(pool["test"]))
+    train, test = make("task", settings["task"]).split(pool["seed"])
+    sizes = pool["size"], pool["options"]
+    return make_pool(train, *sizes, first_seed), make_pool(test, *sizes, first_seed + 2)
 
 
 def draw_pool(settings: Settings, seed: int) -> QueryPool:
-    """A pool of the task, not normalised, by the sections ``task`` and ``pool``."""
-    task = make("task", settings["task"])
-    return make_pool(task, settings["pool"]["size"], settings["pool"]["options"], seed)
+    """A pool to test on, not normalised, by the sections ``task`` and ``pool``."""
+    pool = settings["pool"]
+    _, test = make("task", settings["task"]).split(pool["seed"])
+    return make_pool(test, pool["size"], pool["options"], seed)
 
 
 def make_task(
@@ -174,7 +175,7 @@ def make_task(
             f"pool.test has K={test.n_options} options a query and pool.train K={train.n_options}: "
             "expected the same K; make both with the same pool.options"
         )
-    normalizer = Normalizer.fit(train.features)
+    normalizer = Normalizer.fit(train.features, train.feature_names)
     train, test = train.map_features(normalizer), test.map_features(normalizer)
     if tau == "optimal":
         solved = None

@@ -34,6 +34,9 @@ TABLES: dict[str, Mapping[str, Callable[..., Any]]] = {
 OWN = "own"
 """The name in any group of what the user brings, by ``make``: ``module:name``."""
 
+CODE = {"task": ("make", "features", "policy")}
+"""By group, settings of what is in its table that name code of the user's, as ``module:name``."""
+
 _typed: set[str] = set()
 
 
@@ -58,8 +61,12 @@ def make(group: str, section: Mapping[str, Any], *given: Any, without: tuple[str
         InputError: there is no such thing, or it cannot be made with these settings.
     """
     constructor = find(group, section)
-    left_out = {"name", "make", *without} if section["name"] == OWN else {"name", *without}
+    own = section["name"] == OWN
+    left_out = {"name", "make", *without} if own else {"name", *without}
     keys = {key: value for key, value in section.items() if key not in left_out}
+    for key in () if own else CODE.get(group, ()):
+        if keys.get(key) is not None:
+            keys[key] = _load_typed(f"{group}.{key}", keys[key])
     try:
         inspect.signature(constructor).bind(*given, **keys)
     except TypeError as error:
@@ -93,15 +100,23 @@ def find(group: str, section: Mapping[str, Any]) -> Callable[..., Any]:
     if section["name"] != OWN:
         table = TABLES[group]
         return table[check_choice(group, section["name"], tuple(table))]
-    reference = section.get("make")
+    return _load_typed(group, section.get("make"))
+
+
+def _load_typed(key: str, reference: Any) -> Callable[..., Any]:
+    """Import what a setting names as ``module:name``, if the user typed it.
+
+    Raises:
+        InputError: it is nothing of this form, was not typed, or cannot be imported.
+    """
     if not isinstance(reference, str) or reference.count(":") != 1:
-        raise InputError(f"{group}={reference!r}: expected <module>:<name>")
+        raise InputError(f"{key}={reference!r}: expected <module>:<name>")
     if reference not in _typed:
         raise InputError(
-            f"{group}={reference}: a file names code of yours, which is run only if you type it; "
-            f"add {group}={reference} to the command"
+            f"{key}={reference}: a file names code of yours, which is run only if you type it; "
+            f"add {key}={reference} to the command"
         )
-    return load(f"{group}={reference}", reference)
+    return load(f"{key}={reference}", reference)
 
 
 def load(what: str, reference: str) -> Callable[..., Any]:

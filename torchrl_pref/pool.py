@@ -17,7 +17,7 @@ from torch import Tensor
 from torchrl_pref.errors import InputError
 from torchrl_pref.storage.files import DTYPES, is_dense, load_safely, without_rest
 from torchrl_pref.storage.writing import replacing
-from torchrl_pref.tensors import check_finite, check_plain
+from torchrl_pref.tensors import check_finite, check_names, check_plain, default_names
 
 
 @dataclass(frozen=True)
@@ -27,17 +27,21 @@ class QueryPool:
     Attributes:
         features: (N K D) float32; a copy of what was given, without its gradients.
         trajectories: (N K T …), what a person would be shown, or None.
+        feature_names: D, what each feature is called; by default ``feature 1`` and so on.
 
     Raises:
-        InputError: the features are not (N, K ≥ 1, D ≥ 2) finite numbers, or the trajectories do
-            not belong to them or are of a type that cannot be saved.
+        InputError: the features are not (N, K ≥ 1, D ≥ 2) finite numbers, or the trajectories or
+            the names do not belong to them or cannot be saved.
     """
 
     features: Tensor
     trajectories: Tensor | None = None
+    feature_names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "features", check_features(self.features))
+        names = self.feature_names or default_names(self.n_features)
+        object.__setattr__(self, "feature_names", check_names(names, self.n_features))
         if self.trajectories is not None:
             object.__setattr__(self, "trajectories", self._check_trajectories(self.trajectories))
 
@@ -80,14 +84,16 @@ class QueryPool:
         return hashlib.sha256(repr(content.shape).encode() + content.tobytes()).hexdigest()
 
     def map_features(self, function: Callable[[Tensor], Tensor]) -> QueryPool:
-        """The same queries with other features, such as those of a ``Normalizer``."""
-        return replace(self, features=function(self.features))
+        """The same queries with other features; those of a ``Normalizer`` keep their names."""
+        names = self.feature_names if isinstance(function, Normalizer) else ()
+        return replace(self, features=function(self.features), feature_names=names)
 
     def save(self, path: str | Path) -> None:
         """Write the pool to a file, whole or not at all."""
         shown = None if self.trajectories is None else without_rest(self.trajectories)
         content = {"features": without_rest(self.features), "trajectories": shown}
-        save_atomically({"kind": "query pool", **content}, path)
+        names = list(self.feature_names)
+        save_atomically({"kind": "query pool", **content, "feature_names": names}, path)
 
     @classmethod
     def load(cls, path: str | Path) -> QueryPool:
@@ -105,7 +111,8 @@ class QueryPool:
                 "again with save()"
             )
         try:
-            return cls(features, shown)
+            # Files of earlier versions have no names.
+            return cls(features, shown, content.get("feature_names", ()))
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
 
@@ -169,8 +176,12 @@ class Normalizer:
     std: Tensor
 
     @classmethod
-    def fit(cls, features: Tensor) -> Normalizer:
+    def fit(cls, features: Tensor, names: tuple[str, ...] = ()) -> Normalizer:
         """Measure the statistics of raw features (… D).
+
+        Args:
+            features: (… D).
+            names: D, for messages.
 
         Raises:
             InputError: a feature is no finite number, or never varies, so that no scale makes its
@@ -181,9 +192,10 @@ class Normalizer:
         mean, std = flat.mean(0), flat.std(0, correction=0)
         constant = (std <= 1e-6 * (1 + mean.abs())).nonzero().squeeze(-1).tolist()
         if constant:
+            names = names or default_names(len(std))
             raise InputError(
-                f"feature {', '.join(map(str, constant))} never varies over the training pool: "
-                "expected features that differ between options; drop it, or use a larger pool"
+                f"{', '.join(names[place] for place in constant)} never varies over the training "
+                "pool: expected features that differ between options; drop it, or use a larger pool"
             )
         return cls(mean.float(), std.float())
 

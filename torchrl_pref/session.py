@@ -60,6 +60,8 @@ class Weights(NamedTuple):
     """(B D), below it lie 5% of the samples."""
     high: Tensor
     """(B D), above it lie 5%."""
+    names: tuple[str, ...]
+    """D, what the features are called."""
 
 
 class Session:
@@ -201,8 +203,8 @@ class Session:
         """What is known of the weights."""
         samples = self._states[-1]["samples"]
         low, high = torch.quantile(samples, samples.new_tensor([0.05, 0.95]), dim=1)
-        numbers = samples.mean(1), samples.std(1), low, high
-        return Weights(*map(self._plain, numbers))
+        mean, sd, low, high = map(self._plain, (samples.mean(1), samples.std(1), low, high))
+        return Weights(mean, sd, low, high, self.pool.feature_names)
 
     def score(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """The reward of trajectories, and how sure that is.

@@ -13,6 +13,9 @@ from torch import Tensor
 
 from torchrl_pref.errors import InputError
 
+LONGEST_NAME = 100
+"""Letters of a feature's name."""
+
 
 def check_plain(name: str, tensor: Any) -> Tensor:
     """Return ``tensor`` if it is a dense one of real numbers, with values.
@@ -87,3 +90,28 @@ def check_shape(name: str, tensor: Tensor, expected: tuple[int, ...], meaning: s
         raise InputError(
             f"{name} of shape {tuple(tensor.shape)}: expected {tuple(expected)}, {meaning}"
         )
+
+
+def default_names(n_features: int) -> tuple[str, ...]:
+    """What features are called where nobody named them."""
+    return tuple(f"feature {number}" for number in range(1, n_features + 1))
+
+
+def check_names(names: Any, n_features: int) -> tuple[str, ...]:
+    """Return the names of D features as a tuple.
+
+    Raises:
+        InputError: they are not D different texts of one line.
+    """
+    if not isinstance(names, (list, tuple)) or len(names) != n_features:
+        count = len(names) if isinstance(names, (list, tuple)) else type(names).__name__
+        raise InputError(f"feature_names: {count} for {n_features} features; expected one of each")
+    for name in names:
+        if not isinstance(name, str) or not name.isprintable() or not 0 < len(name) <= LONGEST_NAME:
+            raise InputError(
+                f"feature_names: {name!r:.80}; expected texts of one line and at most "
+                f"{LONGEST_NAME} letters; rename it"
+            )
+    if len(set(names)) < n_features:
+        raise InputError(f"feature_names: {names!s:.200} names one twice; rename one")
+    return tuple(names)

@@ -2,10 +2,12 @@
 
 from collections.abc import Callable
 from itertools import chain
+from pathlib import Path
 
 import my_task
 import pytest
 import torch
+from recordings import DATASET, grid, reach, write_csv, write_minari
 
 from torchrl_pref.errors import InputError
 from torchrl_pref.pool import Normalizer
@@ -14,10 +16,34 @@ from torchrl_pref.tasks.base import Task, make_pool
 from torchrl_pref.tasks.gridworld import GridworldTask, gridworld_pool
 from torchrl_pref.tasks.scene import Disc, Label, Line, Patch, Scene, Shape, corners
 
-MAKE = [*TASKS.values(), my_task.Table]
+GIVEN: dict[str, dict[str, object]] = {
+    "gymnasium": {"length": 20},
+    "torchrl": {"make": grid, "features": reach, "length": 10},
+    "files": {"path": "table.csv"},
+    "minari": {"id": DATASET},
+}
+"""What tasks need to be told."""
 
 
-@pytest.mark.parametrize("make", MAKE)
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recorded")
+    write_csv(folder / "table.csv")
+    write_minari(folder / "minari")
+    return folder
+
+
+@pytest.fixture(params=[*TASKS, "own"])
+def make(
+    request: pytest.FixtureRequest, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[[], Task]:
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(folder / "minari"))
+    if request.param == "own":
+        return my_task.Table
+    return lambda: TASKS[request.param](**GIVEN.get(request.param, {}))
+
+
 def test_a_seed_fixes_the_trajectories(make: Callable[[], Task]) -> None:
     torch.manual_seed(0)
     state = torch.get_rng_state()
@@ -27,7 +53,6 @@ def test_a_seed_fixes_the_trajectories(make: Callable[[], Task]) -> None:
     assert torch.equal(torch.get_rng_state(), state)  # nobody else's luck is used
 
 
-@pytest.mark.parametrize("make", MAKE)
 def test_features_have_names_and_vary(make: Callable[[], Task]) -> None:
     task = make()
     trajectories = task.trajectories(60, 0)
@@ -42,18 +67,17 @@ def test_features_have_names_and_vary(make: Callable[[], Task]) -> None:
     assert torch.equal(pairs.flatten(0, 1), features)
 
 
-@pytest.mark.parametrize("make", MAKE)
 def test_pools(make: Callable[[], Task]) -> None:
     pool = make_pool(make(), 7, 3, seed=1)
     assert pool.features.shape[:2] == (7, 3)
+    assert pool.feature_names == make().feature_names
     assert pool.trajectories is not None
-    assert torch.allclose(make().features(pool.trajectories), pool.features)
+    assert torch.allclose(make().features(pool.trajectories).float(), pool.features)
     for bad in ((0, 2), (5, 1)):
         with pytest.raises(InputError):
             make_pool(make(), *bad, seed=0)
 
 
-@pytest.mark.parametrize("make", MAKE)
 def test_a_scene_stays_within_its_corners(make: Callable[[], Task]) -> None:
     task = make()
     for trajectory in task.trajectories(20, 3):
@@ -83,6 +107,16 @@ def points_of(shape: Shape) -> list[tuple[float, float]]:
 def test_scenes_are_shown_at_one_scale() -> None:
     near, far = Scene((0, -1), (1, 2), (), ((),)), Scene((-3, 0), (0.5, 5), (), ((),))
     assert corners([near, far]) == ((-3, -1), (1, 5))
+
+
+def test_training_and_test_pools_share_no_trajectory(make: Callable[[], Task]) -> None:
+    train, test = make().split(3)
+    pools = make_pool(train, 60, 2, seed=12), make_pool(test, 60, 2, seed=14)
+    seen, unseen = (
+        {tuple(row) for row in pool.trajectories.flatten(0, 1).flatten(1).tolist()}  # type: ignore[union-attr]
+        for pool in pools
+    )
+    assert not seen & unseen
 
 
 def test_the_gridworlds_pool_is_the_tasks() -> None:

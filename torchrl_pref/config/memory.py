@@ -80,7 +80,9 @@ def parts_of(settings: Settings, *pool_shape: int) -> Iterator[Part]:
     of_task = pool["train"] is None
     sizes = ("pool.size", "pool.options") if of_task else ()
     if of_task:
-        walks = 150.0 * pool["size"] * pool["options"] * task.get("length", 1)
+        length = task.get("length", 1)
+        # What is no number is refused later, by the task.
+        walks = 150.0 * pool["size"] * pool["options"] * (length if type(length) is int else 1)
         yield Part("the pools", walks, (*sizes, "task.length"))
     samples = settings["belief"].get("samples", 100)
     budget, offers = setup["budget"], _offers(settings)

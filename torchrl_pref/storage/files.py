@@ -87,14 +87,14 @@ def load_safely(path: str | Path, kind: str) -> dict[str, Any]:
     Raises:
         InputError: the file is missing, unreadable, spoiled, or of another kind.
     """
-    size = _size_of(path, kind)
+    size = size_of(path, kind)
     if size > MAX_FILE:
         raise InputError(
             f"{path}: a file of {size / 2**30:.1f} GiB; expected a {kind} of at most "
             f"{MAX_FILE // 2**30} GiB; split it, or leave the trajectories out"
         )
     try:
-        with _Piecewise(path) as file:
+        with Piecewise(path) as file:
             checked = _checked_copy(file, size)
         content = torch.load(checked, map_location="cpu", weights_only=True)
     except Exception as error:  # whatever the reader trips over, the file is at fault
@@ -125,7 +125,7 @@ def without_rest(tensor: Tensor) -> Tensor:
     return tensor if whole else tensor.clone(memory_format=torch.contiguous_format)
 
 
-def _size_of(path: str | Path, kind: str) -> int:
+def size_of(path: str | Path, kind: str) -> int:
     """The size of a regular file, in bytes."""
     try:
         status = os.stat(path)
@@ -142,7 +142,7 @@ def _size_of(path: str | Path, kind: str) -> int:
     return status.st_size
 
 
-class _Piecewise(io.FileIO):
+class Piecewise(io.FileIO):
     """A file that is never read in large pieces, so that nothing in it decides how large."""
 
     def read(self, size: int | None = -1, /) -> bytes:
@@ -154,7 +154,7 @@ class _Piecewise(io.FileIO):
         return data
 
 
-def _checked_copy(file: _Piecewise, size: int) -> io.BytesIO:
+def _checked_copy(file: Piecewise, size: int) -> io.BytesIO:
     """A new zip in memory with what torch needs of the old one, once all of it has been checked."""
     copy = io.BytesIO()
     with zipfile.ZipFile(file) as old, zipfile.ZipFile(copy, "w") as new:

@@ -31,6 +31,17 @@ class Task(ABC):
     def features(self, trajectories: Tensor) -> Tensor:
         """Features (… D) of trajectories (… T …), not normalised."""
 
+    def split(self, seed: int) -> tuple[Task, Task]:
+        """The task that training queries are about, and the one that test queries are about, which
+        share no trajectory; the same task where every seed gives new ones."""
+        return self, self
+
+    def queries(self, n_queries: int, n_options: int, seed: int) -> Tensor:
+        """Trajectories (N K T …) of queries that a seed fixes; fewer than N where there are no
+        more."""
+        shape = (n_queries, n_options)
+        return self.trajectories(n_queries * n_options, seed).unflatten(0, shape)
+
     def scene(self, trajectory: Tensor) -> Scene:
         """What a person is shown of one trajectory (T …); the features as bars, where a task has
         nothing better."""
@@ -42,7 +53,7 @@ def make_pool(task: Task, n_queries: int, n_options: int, seed: int) -> QueryPoo
 
     Args:
         task: where trajectories come from.
-        n_queries: N, at least 1.
+        n_queries: N, at least 1; there are fewer where the task has no more.
         n_options: K, at least 1.
         seed: fixes the pool.
 
@@ -51,10 +62,9 @@ def make_pool(task: Task, n_queries: int, n_options: int, seed: int) -> QueryPoo
     """
     check_count("pool.size", n_queries, 1)
     check_count("pool.options", n_options, 1)
-    trajectories = task.trajectories(n_queries * n_options, seed)
-    features = task.features(trajectories)
-    shape = (n_queries, n_options)
-    return QueryPool(features.unflatten(0, shape), trajectories.unflatten(0, shape))
+    trajectories = task.queries(n_queries, n_options, seed)
+    features = task.features(trajectories.flatten(0, 1)).unflatten(0, trajectories.shape[:2])
+    return QueryPool(features, trajectories, task.feature_names)
 
 
 def feature_bars(names: tuple[str, ...], features: Tensor) -> Scene:

@@ -226,7 +226,7 @@ def measured(name: str, page: str, minutes: float, more: str = "") -> Part:
 SWEEP = "hydra.sweep.dir={folder}/sweep"
 TWO = "hydra/launcher=joblib hydra.launcher.n_jobs=2"
 CELLS = [f"{setup}-{tau}" for setup in ("feed", "query") for tau in ("noisy", "optimal")]
-GALLERY = ("gridworld", "driver", "lds")
+GALLERY = ("gridworld", "driver", "lds", "gymnasium")
 SHEET = "python -m torchrl_pref.tasks {task} --animate --out {{folder}}/{task}.png -> {task}.gif"
 START = "policy.start=information_gain training.learning_rate=0.01 training.updates=200"
 

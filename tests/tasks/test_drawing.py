@@ -147,7 +147,7 @@ def test_what_cannot_be_drawn_is_refused(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ["bad.png"]
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", ["gridworld", "driver", "lds"])
 def test_a_sheet_shows_every_query(name: str, tmp_path: Path) -> None:
     task = TASKS[name]()
     contact_sheet(task, make_pool(task, 3, 2, 0), tmp_path / "sheet.svg")

@@ -22,6 +22,7 @@ from torchrl_pref.tasks.rollouts import (
     features_of,
     play,
 )
+from torchrl_pref.tasks.viewers import VIEWERS
 
 BESIDE = 32
 """B, environments that are played side by side."""
@@ -57,7 +58,7 @@ class GymnasiumTask(RolloutTask):
         simulator.close()
         self._policy = policy
         sizes = simulator.n_observed, simulator.n_actions
-        super().__init__(*sizes, length, features_of(name, features))
+        super().__init__(*sizes, length, features_of(name, features), VIEWERS.get(name))
 
     def trajectories(self, count: int, seed: int) -> Tensor:
         """See :meth:`Task.trajectories`: rows (count T W), as described in ``rollouts``."""

@@ -21,6 +21,8 @@ from tqdm import tqdm
 
 from torchrl_pref.errors import InputError, check_count
 from torchrl_pref.tasks.base import Task
+from torchrl_pref.tasks.scene import Scene
+from torchrl_pref.tasks.viewers import Viewer, strips
 from torchrl_pref.tensors import check_names, default_names
 
 FeatureMap: TypeAlias = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -29,6 +31,9 @@ FeatureMap: TypeAlias = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 PlayPolicy: TypeAlias = Callable[[Tensor, Generator], Tensor]
 """From observations (B S) and the source of all its luck, to actions (B A)."""
+
+SCALED_BY = 32
+"""Trajectories by which the scale of what is drawn over time is set."""
 
 SHOWN_FROM = 200
 """Trajectories from which on their progress is shown."""
@@ -131,12 +136,22 @@ class RolloutTask(Task):
         n_observed, n_actions: S and A.
         length: T, at least 2.
         features: computes them.
+        viewer: draws an episode; None: each number that is observed over time.
 
     Raises:
         InputError: the features cannot be computed.
     """
 
-    def __init__(self, n_observed: int, n_actions: int, length: int, features: FeatureMap) -> None:
+    def __init__(
+        self,
+        n_observed: int,
+        n_actions: int,
+        length: int,
+        features: FeatureMap,
+        viewer: Viewer | None = None,
+    ) -> None:
+        self._viewer = viewer
+        self._limits: tuple[Tensor, Tensor] | None = None
         self.n_observed, self.n_actions = n_observed, n_actions
         self.length, self._features = check_count("length", length, 2), features
         trial = torch.zeros(2, length, n_observed + n_actions + 1)
@@ -149,6 +164,18 @@ class RolloutTask(Task):
         observations, actions, alive = rows.split([self.n_observed, self.n_actions, 1], dim=-1)
         features = compute_features(self._features, observations, actions, alive.squeeze(-1))
         return features.reshape(*trajectories.shape[:-2], features.shape[-1])
+
+    def scene(self, trajectory: Tensor) -> Scene:
+        """See :meth:`Task.scene`: an episode, of rows (T W), up to where it ends."""
+        lived = trajectory[trajectory[:, -1] > 0, : self.n_observed]
+        return self._over_time(lived) if self._viewer is None else self._viewer(lived)
+
+    def _over_time(self, observations: Tensor) -> Scene:
+        """Each number over time, at a scale that is the same for all episodes."""
+        if self._limits is None:
+            some = self.trajectories(SCALED_BY, seed=0)[..., : self.n_observed].flatten(0, 1)
+            self._limits = some.amin(0), some.amax(0)
+        return strips(observations, *self._limits)
 
 
 def compute_features(

@@ -78,6 +78,7 @@ def parts_of(settings: dict[str, Any], *pool_shape: int) -> Iterator[Part]:
         frames = settings["training"]["sessions"] * steps
         kept = 36.0 * samples * n_features
         kept += 5.0 * (budget * (16 + 4 * n_options) + 8 * offers + 100)
+        kept += 20.0 * _rows_shown(settings) * (n_features + 1)
         kept += _shown(settings, n_queries, n_options, n_features)
         own = "setup.offers" if setup["name"] == "feed" else "setup.candidates"
         keys = ("training.sessions", "training.steps", *beliefs, *sizes, own)
@@ -123,13 +124,19 @@ def _belief_parts(settings: dict[str, Any], n_options: int, n_features: int) -> 
     at_once = max(samples, min(sessions * samples, MOVED // moves))
     directions = 4.0 * (UNIFORMS * moves + 4 * n_features) * at_once
     yield Part("moving the belief", directions, ("belief.samples", "belief.moves"))
-    answers = 8.0 * budget * (n_options - 1) * at_once
+    answers = 8.0 * (budget * (n_options - 1) + _rows_shown(settings)) * at_once
     answers += 8.0 * n_options * n_options * samples
-    keys = ("belief.samples", "setup.budget", "pool.options")
+    keys = ("belief.samples", "setup.budget", "pool.options", "demonstrations.count")
     yield Part("the likelihood of the answers", answers, keys)
     if settings["objective"] == "entropy":
         distances = 8.0 * sessions * samples**2
         yield Part("objective=entropy", distances, ("belief.samples", "evaluation.humans"))
+
+
+def _rows_shown(settings: dict[str, Any]) -> int:
+    """What a session's demonstrations were preferred to, taken together."""
+    shown = settings["demonstrations"]
+    return int(shown["count"] * shown["alternatives"])
 
 
 def _offers(settings: dict[str, Any]) -> int:

@@ -14,6 +14,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from torchrl_pref.config.checks import (
+    LARGEST_TAU,
     LARGEST_THREADS,
     Check,
     check_device,
@@ -54,8 +55,12 @@ TASK: dict[str, Check] = {
     "pool.test": optional(check_path),
     "evaluation.humans": count(2),
     "evaluation.seed": check_seed,
+    "human.tau": optional(check_tau),
     "human.lapse": check_share,
     "belief.lapse": check_share,
+    "demonstrations.count": count(0),
+    "demonstrations.alternatives": count(1),
+    "demonstrations.tau": optional(positive(LARGEST_TAU)),
 }
 """Of both scripts."""
 
@@ -147,7 +152,16 @@ OF_TRAINING: Groups = {
     **OTHERS,
 }
 
-SECTIONS = ("pool", "evaluation", "training", "setup", "policy", "algorithm", *OTHERS)
+SECTIONS = (
+    "pool",
+    "demonstrations",
+    "evaluation",
+    "training",
+    "setup",
+    "policy",
+    "algorithm",
+    *OTHERS,
+)
 
 
 def check_train_settings(settings: Settings) -> None:

@@ -288,6 +288,12 @@ def _chosen(settings: Settings) -> str:
 def _check_together(settings: Settings) -> None:
     """Refuse values that are right one by one and wrong together."""
     pool, setup, belief = settings["pool"], settings["setup"], settings["belief"]
+    shown, walks = settings["demonstrations"], pool["size"] * pool["options"]
+    if pool["train"] is None and shown["count"] and shown["alternatives"] >= walks:
+        raise InputError(
+            f"demonstrations.alternatives={shown['alternatives']} with {walks} trajectories in the "
+            "pool: expected fewer; lower it, or raise pool.size"
+        )
     given = [name for name in ("train", "test") if pool[name] is not None]
     if len(given) == 1 and settings.get("checkpoint") is None:
         raise InputError(

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Generator, Tensor
 
-from torchrl_pref.errors import check_count
+from torchrl_pref.errors import InputError, check_count
 from torchrl_pref.questions.prior_evidence import check_tau
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.questions.responses import Boltzmann, Optimal
@@ -58,11 +58,18 @@ class Demonstrations:
 
         Returns:
             (B G J D), the features of what was shown less those of the alternatives.
+
+        Raises:
+            InputError: there are no J + 1 trajectories.
         """
+        if len(trajectories) <= self.alternatives:
+            raise InputError(
+                f"demonstrations.alternatives={self.alternatives} of {len(trajectories)} "
+                "trajectories in the pool: expected fewer; lower it, or raise pool.size"
+            )
         shape = (len(omega), self.count, self.alternatives + 1)
-        device = trajectories.device
-        index = torch.randint(len(trajectories), shape, generator=generator, device=device)
-        features = trajectories[index]
+        index = different(shape, len(trajectories), generator)
+        features, device = trajectories[index], generator.device
         returns = (seen[index] @ omega[:, None, :, None]).squeeze(-1)
         luck = torch.empty(shape, device=device).exponential_(generator=generator)
         errs = self.tau is not None or not isinstance(model, Optimal)
@@ -71,3 +78,17 @@ class Demonstrations:
         shown = features.take_along_dim(best.unsqueeze(-1), -2)
         others = torch.arange(shape[-1], device=device) != best
         return shown - features[others].unflatten(0, (*shape[:2], self.alternatives))
+
+
+def different(shape: tuple[int, ...], count: int, generator: Generator) -> Tensor:
+    """Indices (… n) below a count, of which no two along the last dimension are the same.
+
+    By Floyd's algorithm (Bentley, *Programming pearls*, 1987): every set is as likely as another.
+    """
+    *leading, size = shape
+    chosen = torch.empty(shape, dtype=torch.int64, device=generator.device)
+    for place, last in enumerate(range(count - size, count)):
+        drawn = torch.randint(last + 1, leading, generator=generator, device=generator.device)
+        taken = (chosen[..., :place] == drawn.unsqueeze(-1)).any(-1)
+        chosen[..., place] = torch.where(taken, last, drawn)
+    return chosen

@@ -26,7 +26,6 @@ from torchrl_pref.humans.demonstrations import Demonstrations
 from torchrl_pref.policies.base import Policy
 from torchrl_pref.pool import Normalizer, QueryPool
 from torchrl_pref.problem import Human, Problem, solve_tau
-from torchrl_pref.questions.prior_evidence import ratio
 from torchrl_pref.questions.responses import model_of
 from torchrl_pref.tasks.base import make_pool
 
@@ -55,9 +54,8 @@ def check_groups(settings: Settings) -> None:
             number = None if known == "optimal" else 1.0 if known == "noisy" else float(known)
             model = model_of(number, question, settings[section]["lapse"])
             made = make(section, settings[section], model, without=ANSWERING)
-            if section == "belief":
-                ratio(make_demonstrations(settings).tau, model)
-            elif n_options is not None and made.step_weights(1) is not None:
+            weighs = section == "human" and made.step_weights(1) is not None
+            if weighs and n_options is not None:
                 weigh_steps(settings, made, draw_pool(settings, 0, 1))
     if settings.get("policy", {}).get("name", "pretrained") != "pretrained":
         find("policy", settings["policy"])

@@ -288,12 +288,7 @@ def _chosen(settings: Settings) -> str:
 def _check_together(settings: Settings) -> None:
     """Refuse values that are right one by one and wrong together."""
     pool, setup, belief = settings["pool"], settings["setup"], settings["belief"]
-    shown, walks = settings["demonstrations"], pool["size"] * pool["options"]
-    if pool["train"] is None and shown["count"] and shown["alternatives"] >= walks:
-        raise InputError(
-            f"demonstrations.alternatives={shown['alternatives']} with {walks} trajectories in the "
-            "pool: expected fewer; lower it, or raise pool.size"
-        )
+    _check_demonstrations(settings)
     given = [name for name in ("train", "test") if pool[name] is not None]
     if len(given) == 1 and settings.get("checkpoint") is None:
         raise InputError(
@@ -315,4 +310,23 @@ def _check_together(settings: Settings) -> None:
         raise InputError(
             f"objective=entropy with belief.samples={belief['samples']}: expected at least 4, as "
             "the entropy is told by the third nearest sample; raise belief.samples"
+        )
+
+
+def _check_demonstrations(settings: Settings) -> None:
+    """Refuse demonstrations that the pool has not enough trajectories for, or the belief no tau."""
+    shown, pool = settings["demonstrations"], settings["pool"]
+    if not shown["count"]:
+        return
+    walks = pool["size"] * pool["options"]
+    if pool["train"] is None and shown["alternatives"] >= walks:
+        raise InputError(
+            f"demonstrations.alternatives={shown['alternatives']} with {walks} trajectories in the "
+            "pool: expected fewer; lower it, or raise pool.size"
+        )
+    taus = settings["tau"] if isinstance(settings["tau"], list) else [settings["tau"]]
+    if shown["tau"] is not None and "optimal" in taus:
+        raise InputError(
+            f"demonstrations.tau={shown['tau']} with tau=optimal: to a belief in a human who never "
+            "errs nothing is shown less carefully; leave demonstrations.tau out, or set tau=noisy"
         )

@@ -112,7 +112,6 @@ class SessionEnv(EnvBase):
         self.objective = objective
         self._objective = make_objective(objective)
         self.demonstrations = demonstrations or Demonstrations()
-        self._ratio = ratio(self.demonstrations.tau, belief.response_model)
         self.budget = check_count("setup.budget", budget, 1)
         self._set_seed(seed)
 
@@ -200,7 +199,8 @@ class SessionEnv(EnvBase):
         rows = self.demonstrations.draw(
             self.features.flatten(0, 1), seen.flatten(0, 1), human["omega"], model, rng
         )
-        return {"rows": self._ratio * rows, "offsets": torch.zeros_like(rows[..., 0])}
+        rows = ratio(self.demonstrations.tau, self.belief.response_model) * rows
+        return {"rows": rows, "offsets": torch.zeros_like(rows[..., 0])}
 
     def _draw_questions(self, size: int) -> dict[str, Tensor]:
         """What is drawn of the questions to come, for B sessions: hidden."""

@@ -78,7 +78,7 @@ def test_what_was_given_first_is_known_and_goes_on(generator: Generator) -> None
     given = [demonstration(best, others, 5.0), correction(best, others[0])]
     plain, session = Session(pool, MODEL, seed=4), Session(pool, MODEL, seed=4, given=given)
     cosines = [torch.cosine_similarity(one.weights.mean, omega, dim=0) for one in (plain, session)]
-    assert cosines[1] > max(0.8, float(cosines[0]))
+    assert cosines[1] > max(0.6, float(cosines[0]))
     converse(session, omega, 3)
     content = json.loads(json.dumps(session.to_dict()))
     again = Session.from_dict(content, pool, MODEL, given=given)

@@ -2,7 +2,7 @@
 
 ``python benchmarks/humans.py``: simulated humans of every kind after 20 questions by greedy
 information gain and greedy alignment gain, with a belief that knows nothing of their imperfection
-and with one that allows for an answer at random in 20. The first row is what the others are held
+and with one that allows for an answer at random in 20, on a pool of 300. The first row is what the others are held
 against: the human whom the belief expects. The humans of all rows have the same ω. Alignment is
 the mean over the samples of their cosine with ω, beside it stands the cosine of their mean, and ±
 is twice its standard error.
@@ -72,7 +72,8 @@ def settings_of(*typed: str | int) -> dict[str, Any]:
     """What ``evaluate.py`` would be given; last the number of humans."""
     *overrides, n_humans = typed
     with initialize_config_dir(str(Path(sys.path[0]) / "conf"), version_base="1.3"):
-        always = ["setup=query", "setup.repeats=false", "tau=4.4", f"evaluation.humans={n_humans}"]
+        always = ["setup=query", "setup.repeats=false", "tau=4.4", "pool.size=300"]
+        always.append(f"evaluation.humans={n_humans}")
         config = compose("evaluate", [*always, *map(str, overrides)])
     settings = OmegaConf.to_container(config)
     assert isinstance(settings, dict)

@@ -216,7 +216,7 @@ def keys_of(config: DictConfig) -> set[str]:
 
 OPTIONS = {
     "train": ["setup=query", "policy=attention", "policy=paper", "algorithm=ppo", "question=weak"],
-    "evaluate": ["setup=query", "question=weak"],
+    "evaluate": ["setup=query", "question=weak", "human=drifting", "human=myopic"],
 }
 
 

@@ -20,6 +20,7 @@ import typed
 from benchmarks import docs_figures
 from torchrl_pref.config.settings import check_evaluate_settings, check_train_settings
 from torchrl_pref.evaluation.records import Entry, Records
+from torchrl_pref.humans import HUMANS
 
 ROOT = Path(__file__).parents[1]
 CARD = ROOT / "torchrl_pref" / "policies" / "weights" / "README.md"
@@ -119,7 +120,8 @@ NO_SETTINGS = ("actor", "csv", "png", "py", "strategy")
 def known_keys() -> set[str]:
     """Every key that either script has, whatever is chosen."""
     groups = ("setup=query", "setup=feed", "question=weak", "policy=attention", "policy=scorer")
-    typed_here = [("train", one) for one in (*groups, "algorithm=ppo")]
+    humans = [f"human={name}" for name in HUMANS]
+    typed_here = [("train", one) for one in (*groups, *humans, "algorithm=ppo")]
     typed_here += [("evaluate", one) for one in groups[:3]]
     keys = set(chain(*(keys_of(OmegaConf.create(composed(*one))) for one in typed_here)))
     return keys | {key.partition(".")[0] for key in keys} | {"experiment"}

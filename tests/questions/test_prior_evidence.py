@@ -112,7 +112,7 @@ def ranks(env: QueryEnv) -> Tensor:
 def test_beliefs_are_calibrated(count: int, alternatives: int) -> None:
     """ω from the prior, demonstrations and then three answers by the model: ω's rank is uniform."""
     pool = QueryPool(torch.randn(200, 2, 3, generator=Generator().manual_seed(5)))
-    model, sessions, samples = Boltzmann(TAU), 2000, 99
+    model, sessions, samples = Boltzmann(TAU), 1500, 99
     shown = Demonstrations(count, alternatives, TAU_SHOWN)
     env = QueryEnv(
         pool,

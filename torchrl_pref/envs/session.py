@@ -231,9 +231,7 @@ class SessionEnv(EnvBase):
     def _session_of(self, tensordict: TensorDictBase) -> tuple[Tree, SessionState]:
         """What is hidden and what is kept of the sessions in a tensordict."""
         session = {**tensordict["session"]}
-        for key in ("history", "given"):
-            if key in session:
-                session[key] = {**session[key]}
+        session["history"] = {**session["history"]}
         return self._hidden_of(tensordict), cast(SessionState, session)
 
     def _hidden_of(self, tensordict: TensorDictBase) -> Tree:

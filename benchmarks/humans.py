@@ -1,11 +1,11 @@
 """What it costs that a human is not as the belief takes them to be.
 
-``python benchmarks/humans.py``: simulated humans of every kind after 20 questions by greedy
-information gain and greedy alignment gain, with a belief that knows nothing of their imperfection
-and with one that allows for an answer at random in 20, on a pool of 300. The first row is what the others are held
-against: the human whom the belief expects. The humans of all rows have the same ω. Alignment is
-the mean over the samples of their cosine with ω, beside it stands the cosine of their mean, and ±
-is twice its standard error.
+``python benchmarks/humans.py``: simulated humans of every kind after 20 questions on a pool of 300,
+by greedy information gain and greedy expected alignment, with a belief that knows nothing of their
+imperfection and with one that allows for an answer at random in 20. The first row is what the
+others are held against: the human whom the belief expects. The humans of all rows have the same ω.
+Alignment is the mean over the samples of their cosine with ω, beside it stands the cosine of their
+mean, and ± is twice the standard error of the latter.
 """
 
 from __future__ import annotations

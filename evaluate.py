@@ -166,7 +166,7 @@ def pretrained_for(settings: Settings, tau: Any) -> dict[str, Checkpoint]:
     from torchrl_pref.pretrained import pretrained_checkpoint
 
     checkpoint = pretrained_checkpoint(settings["setup"]["name"], tau)
-    for section in ("setup", "belief", "skip", "human", "question", "device"):
+    for section in ("setup", "belief", "skip", "human", "demonstrations", "question", "device"):
         checkpoint.settings[section] = settings[section]
     return {f"{policy_key(checkpoint.settings)}:pretrained": checkpoint}
 

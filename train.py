@@ -26,8 +26,8 @@ from torchrl_pref.runs import CHECKPOINT
 from torchrl_pref.storage.writing import write_text
 
 if TYPE_CHECKING:
-    from torchrl_pref.build import Problem
     from torchrl_pref.checkpoints.checkpoint import Checkpoint
+    from torchrl_pref.problem import Problem
     from torchrl_pref.training.trainer import Trainer
 
 CONFIG = "config.yaml"

@@ -25,6 +25,7 @@ ORDER = [
     "runs",
     "groups",
     "checkpoints",
+    "problem",
     "build",
     "evaluation",
     "training",

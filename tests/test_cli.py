@@ -219,7 +219,7 @@ OPTIONS = {
         *("setup=query", "policy=attention", "policy=paper", "algorithm=ppo", "question=weak"),
         *("task=gymnasium", "task=torchrl", "task=files", "task=minari"),
     ],
-    "evaluate": ["setup=query", "question=weak"],
+    "evaluate": ["setup=query", "question=weak", "human=drifting", "human=myopic"],
 }
 
 

@@ -21,6 +21,7 @@ import typed
 from benchmarks import docs_figures
 from torchrl_pref.config.settings import check_evaluate_settings, check_train_settings
 from torchrl_pref.evaluation.records import Entry, Records
+from torchrl_pref.humans import HUMANS
 from torchrl_pref.tasks import TASKS
 
 ROOT = Path(__file__).parents[1]
@@ -122,7 +123,8 @@ def known_keys() -> set[str]:
     """Every key that either script has, whatever is chosen."""
     groups = ("setup=query", "setup=feed", "question=weak", "policy=attention", "policy=scorer")
     tasks = ("task=lds", "task=gymnasium", "task=torchrl", "task=files", "task=minari")
-    typed_here = [("train", one) for one in (*groups, *tasks, "algorithm=ppo")]
+    humans = [f"human={name}" for name in HUMANS]
+    typed_here = [("train", one) for one in (*groups, *tasks, *humans, "algorithm=ppo")]
     typed_here += [("evaluate", one) for one in groups[:3]]
     keys = set(chain(*(keys_of(OmegaConf.create(composed(*one))) for one in typed_here)))
     return keys | {key.partition(".")[0] for key in keys} | {"experiment"}

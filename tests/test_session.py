@@ -15,6 +15,7 @@ from torchrl_pref import Boltzmann, Normalizer, Optimal, QueryPool, Session, Wea
 from torchrl_pref.beliefs.sampled import Belief
 from torchrl_pref.errors import InputError
 from torchrl_pref.humans.simulated import SimulatedHuman
+from torchrl_pref.questions.prior_evidence import correction, demonstration
 from torchrl_pref.strategies import STRATEGIES, RandomQuery
 
 MODEL = Boltzmann(3.0)
@@ -66,6 +67,37 @@ def test_it_goes_on_bit_for_bit_from_json(strategy: str, at: int, generator: Gen
     assert converse(second, omega, 9 - at) == asked[at:]
     assert torch.equal(second.samples, whole.samples)
     assert second.to_dict() == whole.to_dict()
+
+
+def test_what_was_given_first_is_known_and_goes_on(generator: Generator) -> None:
+    """A demonstration and a correction, of one person and of two, through JSON; not of others."""
+    pool = QueryPool(torch.randn(100, 2, 4, generator=generator))
+    omega = torch.tensor([0.6, 0.0, -0.8, 0.0])
+    others = torch.randn(40, 4, generator=generator)
+    best = others[(others @ omega).argmax()]
+    given = [demonstration(best, others, 5.0), correction(best, others[0])]
+    plain, session = Session(pool, MODEL, seed=4), Session(pool, MODEL, seed=4, given=given)
+    cosines = [torch.cosine_similarity(one.weights.mean, omega, dim=0) for one in (plain, session)]
+    assert cosines[1] > max(0.6, float(cosines[0]))
+    converse(session, omega, 3)
+    content = json.loads(json.dumps(session.to_dict()))
+    again = Session.from_dict(content, pool, MODEL, given=given)
+    assert torch.equal(again.samples, session.samples)
+    assert converse(again, omega, 2) == converse(session, omega, 2)
+    for wrong in ((), given[:1], given[::-1]):
+        with pytest.raises(InputError, match="given: the session was made with"):
+            Session.from_dict(content, pool, MODEL, given=wrong)
+    with pytest.raises(InputError, match="given of a session"):
+        Session.from_dict({**content, "given": 3}, pool, MODEL, given=given)
+    old = plain.to_dict()
+    del old["given"]  # as before there was such a thing
+    assert torch.equal(Session.from_dict(old, pool, MODEL).samples, plain.samples)
+    while session.n_answered:
+        session.undo()
+    assert torch.equal(session.samples, Session(pool, MODEL, seed=4, given=given).samples)
+    two = torch.stack([best, -best])
+    side_by_side = Session(pool, MODEL, people=2, given=[correction(two, -two, 5.0)])
+    assert (side_by_side.weights.mean @ best * torch.tensor([1.0, -1.0]) > 0).all()
 
 
 def test_undo_takes_back_and_asks_again(generator: Generator) -> None:

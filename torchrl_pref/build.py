@@ -7,70 +7,31 @@ things and are never code to call, so that a foreign checkpoint can do no harm.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 from torchrl.envs import EnvBase
 
-from torchrl_pref.beliefs.sampled import uniform_sphere
 from torchrl_pref.checkpoints.checkpoint import Checkpoint, picks_by_index
 from torchrl_pref.checkpoints.restore import restore_weights
-from torchrl_pref.config.sections import Settings
+from torchrl_pref.config.sections import GroupSection, Settings
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.envs.session import is_feed
-from torchrl_pref.errors import InputError, check_positive, check_seed
+from torchrl_pref.errors import InputError, check_seed
 from torchrl_pref.groups import find, make, where
+from torchrl_pref.humans.base import HumanBase
+from torchrl_pref.humans.demonstrations import Demonstrations
 from torchrl_pref.policies.base import Policy
 from torchrl_pref.pool import Normalizer, QueryPool
-from torchrl_pref.questions.base import Question
-from torchrl_pref.questions.calibrate import calibrate_tau
-from torchrl_pref.questions.choice import Choice
-from torchrl_pref.questions.response_model import ResponseModel
+from torchrl_pref.problem import Human, Problem, solve_tau
 from torchrl_pref.questions.responses import model_of
 from torchrl_pref.tasks.base import make_pool
 
-NOISY_ACCURACY = 0.9
-"""The paper's "noisy user (90%)"."""
-
-
-@dataclass(frozen=True)
-class Problem:
-    """What a policy is trained and judged on.
-
-    Attributes:
-        train, test: the pools, normalised by the training pool's statistics.
-        normalizer: those statistics.
-        tau: of the simulated human; None for an optimal one.
-        question: what is asked.
-        human_lapse, belief_lapse: share of answers that are given at random, and that the belief
-            takes to be.
-    """
-
-    train: QueryPool
-    test: QueryPool
-    normalizer: Normalizer
-    tau: float | None
-    question: Question = field(default_factory=Choice)
-    human_lapse: float = 0.0
-    belief_lapse: float = 0.0
-
-    @property
-    def title(self) -> str:
-        """What kind of human this is, for tables and figures."""
-        return "optimal human" if self.tau is None else f"noisy human (tau={self.tau:.4g})"
-
-    @property
-    def response_model(self) -> ResponseModel:
-        """How the belief thinks that the human answers."""
-        return model_of(self.tau, self.question, self.belief_lapse)
-
-    @property
-    def human_model(self) -> ResponseModel:
-        """How the human answers."""
-        return model_of(self.tau, self.question, self.human_lapse)
+ANSWERING = ("tau", "lapse")
+"""Settings of a human, or of a belief, that are of the response model, and not of their kind."""
 
 
 def check_groups(settings: Settings) -> None:
@@ -87,13 +48,17 @@ def check_groups(settings: Settings) -> None:
         _try_task(settings)
     taus = settings["tau"] if isinstance(settings["tau"], list) else [settings["tau"]]
     for tau in taus:
-        number = None if tau == "optimal" else 1.0 if tau == "noisy" else float(tau)
-        for section in ("human", "belief"):
-            lapse = settings[section]["lapse"]
-            model = model_of(number, question, lapse)
+        human, belief = settings["human"], settings["belief"]
+        own = tau if human["tau"] is None else human["tau"]
+        for group, section, known in (("human", human, own), ("belief", belief, tau)):
+            number = None if known == "optimal" else 1.0 if known == "noisy" else float(known)
+            model = model_of(number, question, section["lapse"])
             if n_options is not None:
                 model.n_answers(n_options)  # or it is refused here
-            make(section, settings[section], model, without=("lapse",))
+            made = make(group, section, model, without=ANSWERING)
+            weighs = group == "human" and made.step_weights(1) is not None
+            if weighs and n_options is not None:
+                weigh_steps(settings, made, draw_pool(settings, 0, 1))
     if settings.get("policy", {}).get("name", "pretrained") != "pretrained":
         find("policy", settings["policy"])
 
@@ -145,11 +110,36 @@ def make_pools(settings: Settings) -> tuple[QueryPool, QueryPool]:
     return make_pool(train, *sizes, first_seed), make_pool(test, *sizes, first_seed + 2)
 
 
-def draw_pool(settings: Settings, seed: int) -> QueryPool:
-    """A pool to test on, not normalised, by the sections ``task`` and ``pool``."""
+def draw_pool(settings: Settings, seed: int, size: int | None = None) -> QueryPool:
+    """A pool to test on, not normalised, by the sections ``task`` and ``pool``, or of a size."""
     pool = settings["pool"]
     _, test = make("task", settings["task"]).split(pool["seed"])
-    return make_pool(test, pool["size"], pool["options"], seed)
+    return make_pool(test, size or pool["size"], pool["options"], seed)
+
+
+def make_demonstrations(settings: Settings) -> Demonstrations:
+    """What each human shows before the first question, by the section ``demonstrations``."""
+    return Demonstrations(**settings["demonstrations"])
+
+
+def weigh_steps(settings: Settings, human: HumanBase, pool: QueryPool) -> Tensor | None:
+    """Features (N K D) of a pool's options as a human sees them, not normalised; None where that is
+    as the belief does.
+
+    Raises:
+        InputError: the human weighs steps, and the task or the pool cannot tell them.
+    """
+    shown = pool.trajectories
+    weights = human.step_weights(1 if shown is None else shown.shape[2])
+    if weights is None:
+        return None
+    if shown is None:
+        raise InputError(
+            f"human={settings['human']['name']} weighs the steps of trajectories, and the pool has "
+            "none; expected a pool with trajectories; choose another human"
+        )
+    steps = make("task", settings["task"]).step_features(shown)
+    return torch.einsum("t,nktd->nkd", weights.to(steps), steps)
 
 
 def make_task(
@@ -166,10 +156,6 @@ def make_task(
         InputError: the pools do not belong together, a feature never varies, or tau is another
             word.
     """
-    if isinstance(tau, str) and tau not in ("noisy", "optimal"):
-        raise InputError(f"tau={tau!r}: expected noisy, optimal or a number above 0, as in tau=2")
-    if not isinstance(tau, str):
-        check_positive("tau", tau)
     if test.n_options != train.n_options:
         raise InputError(
             f"pool.test has K={test.n_options} options a query and pool.train K={train.n_options}: "
@@ -177,22 +163,29 @@ def make_task(
         )
     normalizer = Normalizer.fit(train.features, train.feature_names)
     train, test = train.map_features(normalizer), test.map_features(normalizer)
-    if tau == "optimal":
-        solved = None
-    elif tau == "noisy":
-        omega = uniform_sphere((2000, train.n_features), torch.Generator().manual_seed(0))
-        returns = torch.einsum("nkd,md->nmk", train.features, omega)
-        solved = calibrate_tau(returns, NOISY_ACCURACY)
-    else:
-        solved = float(tau)
+    solved = solve_tau(tau, train)
     if settings is None:
         return Problem(train, test, normalizer, solved)
     question = make("question", settings["question"])
-    lapses = (settings[section]["lapse"] for section in ("human", "belief"))
-    task = Problem(train, test, normalizer, solved, question, *lapses)
+    human = settings["human"]
+    own = solved if human["tau"] is None else solve_tau(human["tau"], train)
+    who = Human(own, human["lapse"], _kind_of(human))
+    lapse = settings["belief"]["lapse"]
+    task = Problem(train, test, normalizer, solved, question, who, lapse)
     for model in (task.human_model, task.response_model):
         model.n_answers(train.n_options)  # or it is refused here
     return task
+
+
+def _kind_of(section: GroupSection) -> str:
+    """What is particular to a kind of human beside tau and lapses, in words."""
+    usual = {"name": "simulated", "make": None, "spread": 1}
+    name = section.get("make", section["name"])
+    words = [] if name == usual["name"] else [str(name)]
+    for key, value in section.items():
+        if key not in (*ANSWERING, "name", "make") and value != usual.get(key):
+            words.append(f"{key}={value}")
+    return " ".join(words)
 
 
 def reload_task(checkpoint: Checkpoint, train: Path, test: Path) -> Problem:
@@ -236,7 +229,7 @@ def make_query_env(
 ) -> QueryEnv:
     """The query environment on a normalised pool, by the sections ``setup`` and ``belief``."""
     repeats = settings["setup"].get("repeats", True)
-    common = _session_arguments(settings, task, sessions, seed)
+    common = _session_arguments(settings, task, pool, sessions, seed)
     return QueryEnv(pool, candidates=candidates, repeats=repeats, **common)
 
 
@@ -245,7 +238,7 @@ def make_feed_env(
 ) -> FeedEnv:
     """The feed environment on a normalised pool, by the sections ``setup`` and ``belief``."""
     setup = settings["setup"]
-    common = _session_arguments(settings, task, sessions, seed)
+    common = _session_arguments(settings, task, pool, sessions, seed)
     common |= {"on_skip": setup["on_skip"], "skip": settings["skip"]}
     return FeedEnv(pool, offers=setup["offers"], **common)
 
@@ -262,13 +255,16 @@ def make_training_env(
 
 
 def _session_arguments(
-    settings: Settings, task: Problem, sessions: int, seed: int
+    settings: Settings, task: Problem, pool: QueryPool, sessions: int, seed: int
 ) -> dict[str, Any]:
     """What both environments are made with."""
-    belief = settings["belief"]
+    human = make("human", settings["human"], task.human_model, without=ANSWERING)
+    seen = weigh_steps(settings, human, pool)
     return {
-        "human": make("human", settings["human"], task.human_model, without=("lapse",)),
-        "belief": make("belief", belief, task.response_model, without=("lapse",)),
+        "human": human,
+        "belief": make("belief", settings["belief"], task.response_model, without=ANSWERING),
+        "demonstrations": make_demonstrations(settings),
+        "seen": None if seen is None else task.normalizer(seen),
         "budget": settings["setup"]["budget"],
         "objective": settings["objective"],
         "batch_size": (sessions,),

@@ -108,6 +108,18 @@ def check_between(name: str, value: Any, low: float, high: float) -> float:
     return float(value)
 
 
+def check_finite_number(name: str, value: Any) -> float:
+    """Return ``value`` as a float if it is a finite number.
+
+    Raises:
+        InputError: it is not.
+    """
+    number = not isinstance(value, bool) and isinstance(value, (int, float))
+    if not number or not math.isfinite(value):
+        raise InputError(f"{name}={value!r}: expected a finite number, such as {name}=0.5")
+    return float(value)
+
+
 def check_share(name: str, value: Any) -> float:
     """Return ``value`` as a float if it is a number from 0 to 1.
 

@@ -35,10 +35,12 @@ def check_content(content: Any) -> None:
         "seed": lambda value: type(value) is int,
         "queries": turns,
         "answers": turns,
+        "given": lambda value: value is None or isinstance(value, str),
         "asked": lambda value: value is None or numbers(value),
     }
     if not isinstance(content, dict):
         raise InputError(f"a session of type {type(content).__name__}: expected a dict")
+    content = {"given": None, **content}  # sessions of earlier versions were given nothing
     for key, fits in checks.items():
         if key not in content or not fits(content[key]):
             raise InputError(

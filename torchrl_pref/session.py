@@ -17,7 +17,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl_pref.beliefs.base import BeliefBase
 from torchrl_pref.beliefs.sampled import Belief
 from torchrl_pref.envs.query import QueryEnv
-from torchrl_pref.envs.transition import REFUSED, begin, tell
+from torchrl_pref.envs.transition import begin, hear, tell
 from torchrl_pref.errors import (
     InputError,
     check_choice,
@@ -26,9 +26,11 @@ from torchrl_pref.errors import (
     check_seed,
     check_type,
 )
+from torchrl_pref.humans.base import REFUSED
 from torchrl_pref.humans.simulated import SimulatedHuman
 from torchrl_pref.pool import Normalizer, QueryPool
 from torchrl_pref.questions.base import answers_on
+from torchrl_pref.questions.prior_evidence import Shown, given_digest, rows_of_shown
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.saved_session import FORMAT, check_content
 from torchrl_pref.strategies import STRATEGIES, MakeStrategy
@@ -87,6 +89,8 @@ class Session:
         repeats: whether a question may come again; one that a person would not answer, too.
         normalizer: what the pool was normalised by, for :meth:`score` to apply to raw features.
         seed: fixes all luck.
+        given: what the person, or each of the B, showed before the first question, by
+            ``questions.prior_evidence``: demonstrations and corrections.
 
     Raises:
         InputError: something is not what it should be.
@@ -103,6 +107,7 @@ class Session:
         normalizer: Normalizer | None = None,
         seed: int = 0,
         repeats: bool = False,
+        given: Sequence[Shown] = (),
     ) -> None:
         check_type("response_model", response_model, ResponseModel, "Boltzmann(2.0)")
         belief = Belief(response_model) if belief is None else belief
@@ -126,8 +131,12 @@ class Session:
             self.pool, human, belief, budget, repeats=repeats, batch_size=size, seed=seed
         )
         self._strategy = _made(strategy, self._env)
-        samples = belief.prior(size[0], self.pool.n_features, Generator().manual_seed(self.seed))
-        self._states = [begin(samples, budget, self.pool.n_options)]
+        luck, n_features = Generator().manual_seed(self.seed), self.pool.n_features
+        state = begin(belief.prior(size[0], n_features, luck), budget, self.pool.n_options)
+        if given:
+            shown = rows_of_shown(given, size[0], n_features, response_model)
+            state = hear(belief, state, shown, luck)
+        self._states, self._given = [state], given_digest(given)
         self._told: list[tuple[Tensor, Tensor]] = []
         self._asked: Tensor | None = None
 
@@ -242,6 +251,7 @@ class Session:
             "seed": self.seed,
             "queries": [index.tolist() for index, _ in self._told],
             "answers": [answers.tolist() for _, answers in self._told],
+            "given": self._given,
             "asked": None if self._asked is None else self._asked.tolist(),
         }
 
@@ -254,12 +264,13 @@ class Session:
         strategy: str | MakeStrategy = "alignment_gain",
         belief: BeliefBase | None = None,
         normalizer: Normalizer | None = None,
+        given: Sequence[Shown] = (),
     ) -> Session:
         """Go on where :meth:`to_dict` was taken, bit for bit: all answers are let in again.
 
         Args:
             content: what it made; numbers alone, no code.
-            pool, response_model, strategy, belief, normalizer: as the session was made with.
+            pool, response_model, strategy, belief, normalizer, given: as it was made with.
 
         Raises:
             InputError: the content is spoiled, or was made with another pool or belief.
@@ -267,13 +278,14 @@ class Session:
         check_content(content)
         keys = ("budget", "people", "seed", "repeats")
         budget, people, seed, repeats = (content[key] for key in keys)
-        given = strategy, belief, budget, people, normalizer, seed, repeats
-        session = cls(pool, response_model, *given)
+        others = strategy, belief, budget, people, normalizer, seed, repeats, given
+        session = cls(pool, response_model, *others)
         made_with = session.to_dict()
-        for key in ("pool", "response_model", "belief", "strategy"):
-            if content[key] != made_with[key]:
+        for key in ("pool", "response_model", "belief", "strategy", "given"):
+            was = content.get(key)  # sessions of earlier versions were given nothing
+            if was != made_with[key]:
                 raise InputError(
-                    f"{key}: the session was made with {content[key]!s:.80}, and this is "
+                    f"{key}: the session was made with {was!s:.80}, and this is "
                     f"{made_with[key]!s:.80}; expected the same"
                 )
         for queries, answers in zip(content["queries"], content["answers"], strict=True):

@@ -54,7 +54,8 @@ def test_no_number_of_older_settings_is_lost() -> None:
     settings = {"grid": {"size": 5, "length": 7}, "tau_spread": 4, "belief": {"samples": 30}}
     migrate(settings)
     assert settings["task"] == {"name": "gridworld", "size": 5, "length": 7}
-    assert settings["human"] == {"name": "simulated", "spread": 4, "lapse": 0.0}
+    assert settings["human"] == {"name": "simulated", "spread": 4, "tau": None, "lapse": 0.0}
+    assert settings["demonstrations"]["count"] == 0
     assert settings["belief"] == {"name": "sampled", "samples": 30, "lapse": 0.0}
 
 

@@ -38,7 +38,8 @@ LISTS = ("overrides", "logger")
 SECTIONS: dict[str, dict[str, Types]] = {
     "task": {"name": TEXT},
     "question": {"name": TEXT},
-    "human": {"name": TEXT, "lapse": NUMBER},
+    "human": {"name": TEXT, "tau": NUMBER + TEXT + NONE, "lapse": NUMBER},
+    "demonstrations": {"count": WHOLE, "alternatives": WHOLE, "tau": NUMBER + NONE},
     "pool": {
         **dict.fromkeys(("size", "options", "seed"), WHOLE),
         **dict.fromkeys(("train", "test"), TEXT + NONE),

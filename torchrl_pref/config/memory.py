@@ -93,6 +93,7 @@ def parts_of(settings: Settings, *pool_shape: int) -> Iterator[Part]:
         kept = 36.0 * samples * n_features
         n_answers, _ = sizes_of(settings, n_options)
         kept += 5.0 * (budget * (16 + 4 * n_answers) + 8 * offers + 100)
+        kept += 20.0 * _rows_shown(settings) * (n_features + 1)
         kept += _shown(settings, n_queries, n_options, n_features)
         own = "setup.offers" if setup["name"] == "feed" else "setup.candidates"
         keys = ("training.sessions", "training.steps", *beliefs, *sizes, own)
@@ -145,13 +146,19 @@ def _belief_parts(settings: Settings, n_options: int, n_features: int) -> Iterat
     directions = 4.0 * (UNIFORMS * moves + 4 * n_features) * at_once
     yield Part("moving the belief", directions, ("belief.samples", "belief.moves"))
     n_answers, n_rows = sizes_of(settings, n_options)
-    answers = 8.0 * budget * n_rows * at_once
+    answers = 8.0 * (budget * n_rows + _rows_shown(settings)) * at_once
     answers += 8.0 * n_options * n_answers * samples
-    keys = ("belief.samples", "setup.budget", "pool.options")
+    keys = ("belief.samples", "setup.budget", "pool.options", "demonstrations.count")
     yield Part("the likelihood of the answers", answers, keys)
     if settings["objective"] == "entropy":
         distances = 8.0 * sessions * samples**2
         yield Part("objective=entropy", distances, ("belief.samples", "evaluation.humans"))
+
+
+def _rows_shown(settings: Settings) -> int:
+    """What a session's demonstrations were preferred to, taken together."""
+    shown = settings["demonstrations"]
+    return int(shown["count"] * shown["alternatives"])
 
 
 def _offers(settings: Settings) -> int:

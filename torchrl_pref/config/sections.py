@@ -26,6 +26,14 @@ class PoolSection(TypedDict):
     test: str | None
 
 
+class DemonstrationsSection(TypedDict):
+    """``demonstrations``: what each human shows before the first question."""
+
+    count: int
+    alternatives: int
+    tau: float | None
+
+
 class EvaluationSection(TypedDict):
     """``evaluation``: on whom strategies are judged."""
 
@@ -74,6 +82,7 @@ class Settings(TypedDict):
     threads: int
     pool: PoolSection
     evaluation: EvaluationSection
+    demonstrations: DemonstrationsSection
     setup: SetupSection
     task: GroupSection
     question: GroupSection

@@ -14,6 +14,7 @@ from collections.abc import Mapping
 from typing import Any, cast
 
 from torchrl_pref.config.checks import (
+    LARGEST_TAU,
     LARGEST_THREADS,
     Check,
     check_device,
@@ -53,8 +54,12 @@ TASK: dict[str, Check] = {
     "pool.test": optional(check_path),
     "evaluation.humans": count(2),
     "evaluation.seed": check_seed,
+    "human.tau": optional(check_tau),
     "human.lapse": check_share,
     "belief.lapse": check_share,
+    "demonstrations.count": count(0),
+    "demonstrations.alternatives": count(1),
+    "demonstrations.tau": optional(positive(LARGEST_TAU)),
 }
 """Of both scripts."""
 
@@ -149,7 +154,16 @@ OF_TRAINING: Groups = {
     **OTHERS,
 }
 
-SECTIONS = ("pool", "evaluation", "training", "setup", "policy", "algorithm", *OTHERS)
+SECTIONS = (
+    "pool",
+    "demonstrations",
+    "evaluation",
+    "training",
+    "setup",
+    "policy",
+    "algorithm",
+    *OTHERS,
+)
 
 
 def check_train_settings(settings: Plain) -> Settings:
@@ -280,6 +294,7 @@ def _chosen(settings: Plain) -> str:
 def _check_together(settings: Plain) -> None:
     """Refuse values that are right one by one and wrong together."""
     pool, setup, belief = settings["pool"], settings["setup"], settings["belief"]
+    _check_demonstrations(settings)
     given = [name for name in ("train", "test") if pool[name] is not None]
     if len(given) == 1 and settings.get("checkpoint") is None:
         raise InputError(
@@ -303,4 +318,23 @@ def _check_together(settings: Plain) -> None:
         raise InputError(
             f"objective=entropy with belief.samples={belief['samples']}: expected at least 4, as "
             "the entropy is told by the third nearest sample; raise belief.samples"
+        )
+
+
+def _check_demonstrations(settings: Plain) -> None:
+    """Refuse demonstrations that the pool has not enough trajectories for, or the belief no tau."""
+    shown, pool = settings["demonstrations"], settings["pool"]
+    if not shown["count"]:
+        return
+    walks = pool["size"] * pool["options"]
+    if pool["train"] is None and shown["alternatives"] >= walks:
+        raise InputError(
+            f"demonstrations.alternatives={shown['alternatives']} with {walks} trajectories in the "
+            "pool: expected fewer; lower it, or raise pool.size"
+        )
+    taus = settings["tau"] if isinstance(settings["tau"], list) else [settings["tau"]]
+    if shown["tau"] is not None and "optimal" in taus:
+        raise InputError(
+            f"demonstrations.tau={shown['tau']} with tau=optimal: to a belief in a human who never "
+            "errs nothing is shown less carefully; leave demonstrations.tau out, or set tau=noisy"
         )

@@ -16,6 +16,7 @@ from torchrl_pref.envs.session import SessionEnv
 from torchrl_pref.envs.transition import SessionState, Tree
 from torchrl_pref.errors import InputError, check_count, check_flag
 from torchrl_pref.humans.base import HumanBase
+from torchrl_pref.humans.demonstrations import Demonstrations
 from torchrl_pref.pool import QueryPool
 
 
@@ -40,6 +41,8 @@ class QueryEnv(SessionEnv):
         seed: seeds the environment's own generator; the global generators are never used. None: no
             two environments, in whatever process, face the same humans.
         device: where the tensors live.
+        demonstrations: what each human shows before the first question; None is nothing.
+        seen: (N K D), the options as the human sees them, where that is not as the belief does.
 
     Raises:
         InputError: a number is below its minimum, or without repeats the candidates are too few.
@@ -57,8 +60,11 @@ class QueryEnv(SessionEnv):
         batch_size: tuple[int, ...] = (64,),
         seed: int | None = None,
         device: torch.device | str = "cpu",
+        demonstrations: Demonstrations | None = None,
+        seen: Tensor | None = None,
     ) -> None:
-        super().__init__(pool, human, belief, budget, objective, batch_size, seed, device)
+        common = budget, objective, batch_size, seed, device, demonstrations, seen
+        super().__init__(pool, human, belief, *common)
         self.n_candidates = len(pool)
         if candidates is not None:
             self.n_candidates = min(check_count("setup.candidates", candidates, 1), len(pool))

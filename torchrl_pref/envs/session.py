@@ -21,6 +21,7 @@ partial resets, collectors and replay work and one environment serves any batch:
 ``samples``, ``mean``, ``n_asked`` …  the same again: transforms rewrite what is shown, not these
 ``ess``, ``information`` (B 1)        effective sample size; bits gained by the answered queries
 ``history``                           options (B H K D), answers and index (B H): ``History``
+``given``                             where humans show something first: ``Given``
 ``number`` (B 1)                      tells one session from another
 *hidden*: state, and no observation
 ``human``                             omega, noise, care and the number of their session
@@ -36,7 +37,7 @@ from __future__ import annotations
 
 import os
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, cast
 
 import torch
@@ -47,13 +48,23 @@ from torchrl.envs import EnvBase
 
 from torchrl_pref.beliefs.base import BeliefBase
 from torchrl_pref.envs.objectives import make_objective
-from torchrl_pref.envs.state import check_state
-from torchrl_pref.envs.transition import SessionState, Tree, begin, put, rows, tell
+from torchrl_pref.envs.state import check_state, overwrite, spec_of
+from torchrl_pref.envs.transition import (
+    SessionState,
+    Tree,
+    begin,
+    hear,
+    put,
+    rows,
+    tell,
+)
 from torchrl_pref.errors import InputError, check_count, check_type
 from torchrl_pref.humans.base import HumanBase
+from torchrl_pref.humans.demonstrations import Demonstrations
 from torchrl_pref.pool import QueryPool
 from torchrl_pref.questions.base import check_same
-from torchrl_pref.tensors import check_range, check_shape
+from torchrl_pref.questions.prior_evidence import Given, ratio
+from torchrl_pref.tensors import check_finite, check_range, check_shape
 
 
 def is_feed(env: EnvBase) -> bool:
@@ -76,6 +87,8 @@ class SessionEnv(EnvBase):
         batch_size: tuple[int, ...],
         seed: int | None,
         device: torch.device | str,
+        demonstrations: Demonstrations | None,
+        seen: Tensor | None,
     ) -> None:
         if not isinstance(batch_size, Sequence) or len(batch_size) != 1:
             raise InputError(f"batch_size={batch_size}: expected one size, such as (64,)")
@@ -88,11 +101,17 @@ class SessionEnv(EnvBase):
             check_count("seed", seed, 0)
         super().__init__(device=device, batch_size=torch.Size(batch_size))
         self.register_buffer("features", pool.features.to(device))
+        if seen is not None:
+            check_shape("seen", seen, tuple(pool.features.shape), "of the features in the pool")
+            check_finite("seen", seen)
+            seen = seen.to(device)
+        self.register_buffer("seen", seen)
         self.human = human
         self.n_answers = human.response_model.n_answers(pool.n_options)
         self.belief = belief
         self.objective = objective
         self._objective = make_objective(objective)
+        self.demonstrations = demonstrations or Demonstrations()
         self.budget = check_count("setup.budget", budget, 1)
         self._set_seed(seed)
 
@@ -104,8 +123,8 @@ class SessionEnv(EnvBase):
         batch, device = self.batch_size, self.device
         shown = self._shown(session, hidden)
         kept = {"session": session}
-        self.state_spec = _spec_of(TensorDict({**hidden, **kept}, batch, device=device))
-        self.observation_spec = _spec_of(TensorDict({**shown, **kept}, batch, device=device))
+        self.state_spec = spec_of(TensorDict({**hidden, **kept}, batch, device=device))
+        self.observation_spec = spec_of(TensorDict({**shown, **kept}, batch, device=device))
         self.action_spec = self._choice_of(n_actions)
         self.reward_spec = Unbounded(shape=(*batch, 1), device=device)
         flag = Binary(n=1, shape=(*batch, 1), dtype=torch.bool, device=device)
@@ -149,8 +168,8 @@ class SessionEnv(EnvBase):
             state = TensorDict({**hidden, "session": session}, self.batch_size, device=self.device)
             given = check_state(tensordict, state, len(self.features), self.n_answers)
             given = given.clone().to_dict()
-            _overwrite(hidden, given)
-            _overwrite(cast(Tree, session), given.get("session", {}))
+            overwrite(hidden, given)
+            overwrite(cast(Tree, session), given.get("session", {}))
             session["mean"] = session["samples"].mean(1)
         mask = None if tensordict is None else tensordict.get("_reset", None)
         self._remember(hidden, mask)
@@ -169,7 +188,19 @@ class SessionEnv(EnvBase):
         # The bits of a number of the prior: another one for each session, and no draw more.
         human["number"] = number = session["samples"][:, 0, :1].clone().view(torch.int32)
         hidden: Tree = {"human": human, **self._draw_questions(size)}
+        if self.demonstrations.count:
+            session = hear(self.belief, session, self._given_by(human), rng)
         return hidden, self._counted(session, number)
+
+    def _given_by(self, human: Tree) -> Given:
+        """What humans show before the first question, of the trajectories in the pool."""
+        seen = self.features if self.seen is None else self.seen
+        model, rng = self.human.response_model, self.generator
+        rows = self.demonstrations.draw(
+            self.features.flatten(0, 1), seen.flatten(0, 1), human["omega"], model, rng
+        )
+        rows = ratio(self.demonstrations.tau, self.belief.response_model) * rows
+        return {"rows": rows, "offsets": torch.zeros_like(rows[..., 0])}
 
     def _draw_questions(self, size: int) -> dict[str, Tensor]:
         """What is drawn of the questions to come, for B sessions: hidden."""
@@ -258,7 +289,8 @@ class SessionEnv(EnvBase):
     def _answered(self, session: SessionState, human: Tree, index: Tensor) -> SessionState:
         """Sessions (B) after their humans answered pool queries ``index`` (B)."""
         options = self.features[index]
-        answers = self.human.respond(options, human, session["n_asked"].squeeze(-1))
+        seen = options if self.seen is None else self.seen[index]
+        answers = self.human.respond(seen, human, session["n_asked"].squeeze(-1))
         return tell(self.belief, session, options, answers, index, self.generator)
 
     def _finish(
@@ -279,23 +311,3 @@ class SessionEnv(EnvBase):
 
     @abstractmethod
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase: ...
-
-
-def _overwrite(tree: Tree, given: Mapping[str, Any]) -> None:
-    """Take the tensors that are given in the place of a tree's own."""
-    for key in tree.keys() & given.keys():
-        if isinstance(tree[key], dict):
-            _overwrite(tree[key], given[key])
-        else:
-            tree[key] = given[key]
-
-
-def _spec_of(state: TensorDictBase) -> Composite:
-    """Unbounded specs of the shapes and types in a state."""
-    spec = Composite(shape=state.batch_size, device=state.device)
-    for key, value in state.items(include_nested=True, leaves_only=True):
-        if value.dtype == torch.bool:
-            spec[key] = Binary(n=value.shape[-1], shape=value.shape, dtype=torch.bool)
-        else:
-            spec[key] = Unbounded(shape=value.shape, dtype=value.dtype)
-    return spec.to(state.device)

@@ -6,13 +6,15 @@ features, H query budget, O offers.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.data import Binary, Composite, Unbounded
 
-from torchrl_pref.envs.transition import LEFT_OUT, NOT_OF_THE_POOL, OPEN, History
+from torchrl_pref.envs.transition import LEFT_OUT, NOT_OF_THE_POOL, OPEN, History, Tree
 from torchrl_pref.errors import InputError
 from torchrl_pref.tensors import check_finite, check_plain, check_range, check_shape
 
@@ -24,6 +26,8 @@ MEANING = {
     "human.care": "sessions and one factor",
     "session.samples": "sessions, samples of the belief and features",
     "session.mean": "sessions and features",
+    "session.given.rows": "sessions, demonstrations, alternatives and features",
+    "session.given.offsets": "sessions, demonstrations and alternatives",
     "session.history.options": "sessions, asks (the budget), options and features",
     "session.history.answers": "sessions and asks (the budget)",
     "session.history.index": "sessions and asks (the budget)",
@@ -68,6 +72,8 @@ def check_state(
     _check_ranges(state, fresh, n_queries, n_answers)
     _check_vectors(state)
     _check_history(state)
+    if ("session", "given", "rows") in fresh.keys(True):
+        _check_given(state)
     return TensorDict(state, fresh.batch_size, device=fresh.device)
 
 
@@ -115,7 +121,8 @@ def _check_part(name: str, value: Tensor, expected: Tensor) -> Tensor:
         )
     value = value.detach().to(expected)
     if value.is_floating_point():
-        check_finite(name, value)
+        may_be_infinite = name == "session.given.offsets"
+        check_finite(name, value[value != torch.inf] if may_be_infinite else value)
     return value
 
 
@@ -131,6 +138,23 @@ def _check_vectors(state: dict[Key, Tensor]) -> None:
         raise InputError("human.omega of length 0: expected a direction; give weights above zero")
     if (state.get(("human", "care"), torch.ones(1)) <= 0).any():
         raise InputError("human.care of 0 or less: expected a factor above 0; 1 is the model's tau")
+
+
+def _check_given(state: dict[Key, Tensor]) -> None:
+    """Whoever showed something comes with it, and with the belief that it led to."""
+    together: tuple[Key, ...] = (
+        ("human", "omega"),
+        ("session", "samples"),
+        ("session", "given", "rows"),
+        ("session", "given", "offsets"),
+    )
+    missing = [key for key in together if key not in state]
+    if 0 < len(missing) < len(together):
+        raise InputError(
+            f"humans who show something before the first question, without "
+            f"{', '.join(map(_name, missing))}: expected all of "
+            f"{', '.join(map(_name, together))}; give them as env.reset() returns them"
+        )
 
 
 def _check_history(state: dict[Key, Tensor]) -> None:
@@ -156,3 +180,23 @@ def _check_history(state: dict[Key, Tensor]) -> None:
             "a history of answers without the samples of the belief that they led to: expected "
             "both; give session.samples too, or leave the history out"
         )
+
+
+def overwrite(tree: Tree, given: Mapping[str, Any]) -> None:
+    """Take the tensors that are given in the place of a tree's own."""
+    for key in tree.keys() & given.keys():
+        if isinstance(tree[key], dict):
+            overwrite(tree[key], given[key])
+        else:
+            tree[key] = given[key]
+
+
+def spec_of(state: TensorDictBase) -> Composite:
+    """Unbounded specs of the shapes and types in a state."""
+    spec = Composite(shape=state.batch_size, device=state.device)
+    for key, value in state.items(include_nested=True, leaves_only=True):
+        if value.dtype == torch.bool:
+            spec[key] = Binary(n=value.shape[-1], shape=value.shape, dtype=torch.bool)
+        else:
+            spec[key] = Unbounded(shape=value.shape, dtype=value.dtype)
+    return spec.to(state.device)

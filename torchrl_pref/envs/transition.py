@@ -18,11 +18,13 @@ from torchrl_pref.acquisition.functions import information_gain
 from torchrl_pref.acquisition.scoring import score_queries
 from torchrl_pref.beliefs.base import BeliefBase
 from torchrl_pref.errors import InputError
+from torchrl_pref.humans.base import REFUSED
+from torchrl_pref.questions.prior_evidence import Given, evidence_of, joined
 from torchrl_pref.tensors import check_range
 
-OPEN, REFUSED, LEFT_OUT = -1, -2, -3
-"""Marks in a history in the place of an answer: not asked yet; asked, and the person would not say;
-answered, but against what they had answered before, so that the belief does not hold it."""
+OPEN, LEFT_OUT = -1, -3
+"""Marks in a history in the place of an answer, beside ``REFUSED``: not asked yet; answered, but
+against what they had answered before, so that the belief does not hold it."""
 
 NOT_OF_THE_POOL = -1
 """The pool index of a query that is of no pool, and of one that is not asked yet."""
@@ -56,6 +58,8 @@ class SessionState(TypedDict):
     n_asked: Tensor
     """(B 1), queries asked so far."""
     history: History
+    given: NotRequired[Given]
+    """Where people showed something before the first question."""
     n_offered: NotRequired[Tensor]
     """(B 1), queries offered so far, where they are offered."""
     number: NotRequired[Tensor]
@@ -85,6 +89,28 @@ def begin(samples: Tensor, budget: int, n_options: int) -> SessionState:
             "index": torch.full_like(open_slots, NOT_OF_THE_POOL),
         },
     }
+
+
+def hear(
+    belief: BeliefBase, session: SessionState, given: Given, generator: Generator
+) -> SessionState:
+    """Sessions that begin, after what people showed before the first question.
+
+    Args:
+        belief: how evidence becomes a belief.
+        session: as :func:`begin` makes it.
+        given: what they showed; of what contradicts the rest the belief holds nothing.
+        generator: the source of the belief's luck.
+    """
+    samples, ess = session["samples"], session["ess"].squeeze(-1)
+    offsets = given["offsets"].clone()
+    for g in range(offsets.shape[1]):
+        evidence = evidence_of({"rows": given["rows"], "offsets": offsets})
+        samples, ess, used = belief.update(samples, ess, evidence[:, : g + 1], generator)
+        offsets[:, g] = offsets[:, g].masked_fill(~used.unsqueeze(-1), torch.inf)
+    heard: Given = {"rows": given["rows"], "offsets": offsets}
+    known = {"samples": samples, "mean": samples.mean(1), "ess": ess.unsqueeze(-1), "given": heard}
+    return cast(SessionState, {**session, **known})
 
 
 def tell(
@@ -145,6 +171,8 @@ def _learn(
     given, query = given.clamp(min=OPEN), options.unsqueeze(1)
     model = belief.response_model
     evidence = model.evidence(torch.cat([past, query], 1), torch.cat([given, answers[:, None]], 1))
+    if "given" in session:
+        evidence = joined(evidence_of(session["given"]), evidence)
     update = belief.update(samples, session["ess"].squeeze(-1), evidence, generator)
     gain = score_queries(samples, query, model, information_gain)
     session["samples"], session["mean"] = update.samples, update.samples.mean(1)

@@ -10,7 +10,7 @@ import torch
 from tqdm import tqdm
 
 from torchrl_pref.acquisition.functions import alignment_gain
-from torchrl_pref.build import Problem, load_policy, make_feed_env, make_query_env
+from torchrl_pref.build import load_policy, make_feed_env, make_query_env
 from torchrl_pref.checkpoints.checkpoint import Checkpoint
 from torchrl_pref.config.memory import check_memory
 from torchrl_pref.config.sections import Settings
@@ -23,6 +23,7 @@ from torchrl_pref.evaluation.run import CURVES, Evaluation, draw_humans, evaluat
 from torchrl_pref.evaluation.side_by_side import Entrant
 from torchrl_pref.policies.base import Policy
 from torchrl_pref.pool import QueryPool
+from torchrl_pref.problem import Problem
 from torchrl_pref.strategies import Greedy, QuantileAsk, RandomAsk, RandomQuery
 
 FIRST_EVALUATION_SEED = 2**31
@@ -210,6 +211,7 @@ def group_checkpoints(
                 ("budget", *(c.settings["setup"]["budget"] for c in (checkpoint, first))),
                 ("belief", *(c.settings["belief"] for c in (checkpoint, first))),
                 ("human", *(c.settings["human"] for c in (checkpoint, first))),
+                ("demonstrations", *(c.settings["demonstrations"] for c in (checkpoint, first))),
                 ("question", *(c.settings["question"] for c in (checkpoint, first))),
                 ("skip", _skip_of(checkpoint), next(filter(None, map(_skip_of, all_of)), None)),
                 ("feed", _feed_of(checkpoint), next(filter(None, map(_feed_of, all_of)), None)),

@@ -113,7 +113,17 @@ def _start_worker() -> None:
     torch.multiprocessing.set_sharing_strategy("file_system")
 
 
-APART = ("task", "question", "human", "belief", "setup", "policy", "objective", "algorithm")
+APART = (
+    "task",
+    "question",
+    "human",
+    "demonstrations",
+    "belief",
+    "setup",
+    "policy",
+    "objective",
+    "algorithm",
+)
 """Settings by which policies of one cell are of several kinds; the seed alone makes no kind."""
 
 

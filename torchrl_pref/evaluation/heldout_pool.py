@@ -16,7 +16,6 @@ from torch import Tensor
 
 from torchrl_pref.acquisition.functions import alignment_gain, information_gain, volume_removal
 from torchrl_pref.build import (
-    Problem,
     draw_pool,
     load_policy,
     make_feed_env,
@@ -36,6 +35,7 @@ from torchrl_pref.evaluation.run import draw_humans
 from torchrl_pref.evaluation.side_by_side import Entrant, run_side_by_side
 from torchrl_pref.evaluation.style import kind_of
 from torchrl_pref.pool import QueryPool, balance
+from torchrl_pref.problem import Problem
 from torchrl_pref.strategies import (
     Greedy,
     Lookahead,

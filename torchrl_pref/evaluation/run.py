@@ -51,8 +51,10 @@ class Evaluation:
 
 
 def draw_humans(env: EnvBase) -> TensorDict:
-    """Humans, their luck, prior samples and a feed's offers, for every strategy to start from."""
-    return env.reset().select("human", ("session", "samples"), "offers", strict=False)
+    """Humans, their luck, what they showed, the belief before the first question and a feed's
+    offers, for every strategy to start from."""
+    kept = ("session", "samples"), ("session", "ess"), ("session", "given")
+    return env.reset().select("human", *kept, "offers", strict=False)
 
 
 def evaluate(

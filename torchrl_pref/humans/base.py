@@ -1,6 +1,7 @@
 """What everybody who is asked can do.
 
-Shapes: B sessions, H query budget, K options per query, R possible answers, D features.
+Shapes: B sessions, H query budget, K options per query, R possible answers, T trajectory length, D
+features.
 """
 
 from __future__ import annotations
@@ -12,6 +13,9 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Generator, Tensor
 
 from torchrl_pref.questions.response_model import ResponseModel
+
+REFUSED = -2
+"""The answer of someone who would not say: it counts as asked, and teaches nothing."""
 
 
 class HumanBase(ABC):
@@ -47,9 +51,15 @@ class HumanBase(ABC):
             turn: (B), how many queries each human has answered before.
 
         Returns:
-            (B) int64, the index of the answer, or -2 (``envs.transition.REFUSED``) where they
-            would not say.
+            (B) int64, the index of the answer, or ``REFUSED`` where they would not say.
 
         Raises:
             InputError: the returns are not finite.
         """
+
+    def step_weights(self, n_steps: int) -> Tensor | None:
+        """(T), how much each step of a trajectory counts to them: they see queries so weighted.
+
+        None, as here, where they see what the belief sees: the features of whole trajectories.
+        """
+        return None

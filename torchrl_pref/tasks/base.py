@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 
 from torch import Tensor
 
-from torchrl_pref.errors import check_count
+from torchrl_pref.errors import InputError, check_count
 from torchrl_pref.pool import QueryPool
 from torchrl_pref.tasks.scene import Label, Patch, Scene, Shape
 
@@ -41,6 +41,18 @@ class Task(ABC):
         more."""
         shape = (n_queries, n_options)
         return self.trajectories(n_queries * n_options, seed).unflatten(0, shape)
+
+    def step_features(self, trajectories: Tensor) -> Tensor:
+        """Features (… T D) of the steps of trajectories (… T …), not normalised, whose mean over
+        the steps are the features, where a task has such.
+
+        Raises:
+            InputError: it has not.
+        """
+        raise InputError(
+            f"{type(self).__name__} has features of whole trajectories alone: expected a task "
+            "whose features are means over the steps, such as task=gridworld, or another human"
+        )
 
     def scene(self, trajectory: Tensor) -> Scene:
         """What a person is shown of one trajectory (T …); the features as bars, where a task has

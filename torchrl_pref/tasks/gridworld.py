@@ -130,10 +130,15 @@ def corner_distances(positions: Tensor, size: int) -> Tensor:
     Returns:
         (… 4), Euclidean distances in cells, averaged over the trajectory.
     """
+    return distances_of_steps(positions, size).mean(-2)
+
+
+def distances_of_steps(positions: Tensor, size: int) -> Tensor:
+    """The distance of each step (… T 4) to each corner, in cells; see :func:`corner_distances`."""
     edge = float(size - 1)
     corners = torch.tensor([[0.0, 0.0], [0.0, edge], [edge, 0.0], [edge, edge]])
     offsets = positions.float().unsqueeze(-2) - corners.to(positions.device)
-    return offsets.norm(dim=-1).mean(-2)
+    return offsets.norm(dim=-1)
 
 
 class GridworldTask(Task):
@@ -160,6 +165,10 @@ class GridworldTask(Task):
     def features(self, trajectories: Tensor) -> Tensor:
         """See :meth:`Task.features`: (… 4), mean distances in cells."""
         return corner_distances(trajectories, self.size)
+
+    def step_features(self, trajectories: Tensor) -> Tensor:
+        """See :meth:`Task.step_features`: (… T 4), distances in cells."""
+        return distances_of_steps(trajectories, self.size)
 
     def scene(self, trajectory: Tensor) -> Scene:
         """See :meth:`Task.scene`: the cells, darker the longer the walk stayed there, its way

@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_pref.acquisition.functions import alignment_gain
-from torchrl_pref.build import Problem, make_policy, make_training_env
+from torchrl_pref.build import make_policy, make_training_env
 from torchrl_pref.checkpoints.checkpoint import picks_by_index
 from torchrl_pref.config.sections import Settings
 from torchrl_pref.envs.feed import FeedEnv
@@ -23,6 +23,7 @@ from torchrl_pref.envs.session import is_feed
 from torchrl_pref.evaluation.comparison import check_evaluation
 from torchrl_pref.evaluation.run import draw_humans, evaluate
 from torchrl_pref.policies.base import Policy
+from torchrl_pref.problem import Problem
 from torchrl_pref.strategies import Greedy, QuantileAsk
 from torchrl_pref.training.trainer import Trainer
 

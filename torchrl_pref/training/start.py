@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import torch
 
-from torchrl_pref.build import Problem, make_policy, make_training_env
+from torchrl_pref.build import make_policy, make_training_env
 from torchrl_pref.checkpoints.checkpoint import Checkpoint
 from torchrl_pref.config.sections import Settings
 from torchrl_pref.errors import check_choice, check_seed
+from torchrl_pref.problem import Problem
 from torchrl_pref.training.algorithms import ALGORITHMS
 from torchrl_pref.training.settings import TrainingSettings
 from torchrl_pref.training.trainer import Trainer

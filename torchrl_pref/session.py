@@ -31,7 +31,7 @@ from torchrl_pref.pool import Normalizer, QueryPool
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.saved_session import FORMAT, check_content
 from torchrl_pref.strategies import STRATEGIES, MakeStrategy
-from torchrl_pref.tensors import check_finite, check_plain
+from torchrl_pref.tensors import check_finite, check_plain, directions
 
 PRIME = 1_000_003
 """Between the seeds of two sessions there is room for so many answers."""
@@ -191,8 +191,8 @@ class Session:
 
     @property
     def weights(self) -> Weights:
-        """What is known of the weights."""
-        samples = self._states[-1]["samples"]
+        """What is known of the weights: of their directions."""
+        samples = directions(self._states[-1]["samples"])
         low, high = torch.quantile(samples, samples.new_tensor([0.05, 0.95]), dim=1)
         numbers = samples.mean(1), samples.std(1), low, high
         return Weights(*map(self._plain, numbers))
@@ -216,7 +216,7 @@ class Session:
             raise InputError(
                 f"features of shape {tuple(features.shape)}: expected (n, {self.pool.n_features})"
             )
-        rewards = self._states[-1]["samples"] @ features.mT
+        rewards = directions(self._states[-1]["samples"]) @ features.mT
         return self._plain(rewards.mean(1)), self._plain(rewards.std(1))
 
     def to_dict(self) -> dict[str, Any]:

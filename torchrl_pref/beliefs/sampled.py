@@ -20,7 +20,7 @@ from torch import Generator, Tensor
 from torch.nn import functional as F
 
 from torchrl_pref.beliefs.base import BeliefBase, Update
-from torchrl_pref.beliefs.resampling import kish_share, resample
+from torchrl_pref.beliefs.resampling import explained_share, kish_share, resample
 from torchrl_pref.beliefs.slice import Target, round_of_moves
 from torchrl_pref.config.memory import default_moves
 from torchrl_pref.errors import check_count, check_type
@@ -297,17 +297,19 @@ class Belief(BeliefBase):
         """New samples (S M D) and the inflation (S) of the variance of their mean."""
         start, factor = resample(samples, log_weights, generator)
         excess = inflation * factor - 1
-        n_moves = self._moves_for(samples.shape[2])
-        moved, explained = round_of_moves(start, start, n_moves, target, generator)
-        inflation = 1 + explained * excess
+        moved = self._move(start, target, generator)
+        inflation = 1 + explained_share(start, moved) * excess
         for _ in range(MAX_ROUNDS - 1):
             who = (inflation > 1 / FORGOTTEN).nonzero().squeeze(-1)
             if who.numel() == 0:
                 break
-            again = start[who], moved[who], n_moves, target.of(who)
-            moved[who], explained = round_of_moves(*again, generator)
-            inflation[who] = 1 + explained * excess[who]
+            moved[who] = self._move(moved[who], target.of(who), generator)
+            inflation[who] = 1 + explained_share(start[who], moved[who]) * excess[who]
         return moved, inflation.clamp(1, samples.shape[1])
+
+    def _move(self, samples: Tensor, target: Target, generator: Generator) -> Tensor:
+        """Samples (S M D) after Markov moves that leave the target invariant."""
+        return round_of_moves(samples, self._moves_for(samples.shape[2]), target, generator)
 
 
 def _furthest(start: Tensor, end: Tensor, fits: Callable[[Tensor], Tensor]) -> Tensor:

@@ -21,12 +21,13 @@ import torch
 from torch import Generator, Tensor
 from torch.nn import functional as F
 
-from torchrl_pref.beliefs.resampling import FRAMES, explained_share, group_of, poles_of
+from torchrl_pref.beliefs.resampling import FRAMES, group_of, poles_of
 from torchrl_pref.beliefs.slice_cpu import move_sessions
 from torchrl_pref.compiled import over_sessions
 from torchrl_pref.questions.base import Evidence
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.questions.responses import compiled_constants
+from torchrl_pref.tensors import directions, lengths
 
 ARC = 32.0
 """Length of the arc that is searched, in standard deviations of the posterior along it. A short
@@ -56,27 +57,27 @@ class Target(NamedTuple):
 
 
 def round_of_moves(
-    start: Tensor,
     samples: Tensor,
     n_moves: int,
     target: Target,
     generator: Generator,
-) -> tuple[Tensor, Tensor]:
+) -> Tensor:
     """Move every sample V times, each time along the great circle through it and a pole.
+
+    A sample keeps its length: it moves on a sphere of its own.
 
     The posterior is left invariant if a pole does not depend on the samples that move towards it:
     it is drawn from the spread of the other groups. On a circle the uniform measure of the sphere
     has density |sin ∠(ω, pole)|^(D-2): the meridians of a sphere crowd at its poles.
 
     Args:
-        start: (S M D), where the samples were before any moves.
-        samples: (S M D), where they are.
+        samples: (S M D).
         n_moves: V.
         target: what the moves leave invariant.
         generator: the source of randomness, on the device of the samples.
 
     Returns:
-        Samples (S M D), and how much of their variance ``start`` explains (S).
+        (S M D), each as long as before.
     """
     n_sessions, n_samples, n_features = samples.shape
     device = samples.device
@@ -84,31 +85,33 @@ def round_of_moves(
     normal = torch.randn(shape, generator=generator, device=device)
     size = (n_moves, n_sessions, n_samples, 2 + MAX_SHRINKS)
     uniform = torch.rand(size, generator=generator, device=device)
-    poles = poles_of(samples, normal)
+    poles = poles_of(directions(samples), normal)
     constants = compiled_constants(target.response_model)
     if samples.is_cpu and constants is not None:
         answers, slack, power, _ = target
         evidence = answers.rows, answers.offsets, answers.floor
-        moved = compiled_moves(samples, poles, uniform, *evidence, slack, power, ARC, *constants)
-    else:
-        moved = tensor_moves(samples, poles, uniform, target)
-    return moved, explained_share(start, moved)
+        return compiled_moves(samples, poles, uniform, *evidence, slack, power, ARC, *constants)
+    return tensor_moves(samples, poles, uniform, target)
 
 
 def tensor_moves(samples: Tensor, poles: Tensor, uniform: Tensor, target: Target) -> Tensor:
     """:func:`round_of_moves` in tensors, with poles (V S P D) and uniforms (V S M U) given.
 
     Returns:
-        (S M D), unit vectors.
+        (S M D), each as long as before.
     """
     group = group_of(samples.shape[1], poles.shape[2], samples.device)
+    length, samples = lengths(samples), directions(samples)
     for ahead, luck in zip(poles, uniform, strict=True):
-        samples = _tensor_move(samples, ahead[:, group], luck, target)
-    return samples
+        samples = _tensor_move(samples, length, ahead[:, group], luck, target)
+    return samples * length
 
 
-def _tensor_move(samples: Tensor, poles: Tensor, uniform: Tensor, target: Target) -> Tensor:
-    """One move of samples (S M D) towards a pole each (S M D), with uniforms (S M U).
+def _tensor_move(
+    samples: Tensor, length: Tensor, poles: Tensor, uniform: Tensor, target: Target
+) -> Tensor:
+    """One move of unit vectors (S M D), whose gaps count by a length (S M 1), towards a pole each
+    (S M D), with uniforms (S M U).
 
     Every sample goes through all shrinks, also when it has found its place, so that nothing has
     to be counted and no device is waited for.
@@ -123,8 +126,8 @@ def _tensor_move(samples: Tensor, poles: Tensor, uniform: Tensor, target: Target
     answers = target.answers
     size = (*answers.rows.shape[:-1], samples.shape[1])
     rows = answers.rows.flatten(1, -2)
-    cosine = (rows @ samples.mT).view(size).permute(1, 2, 3, 0, 4).contiguous()
-    sine = (rows @ tangents.mT).view(size).permute(1, 2, 3, 0, 4).contiguous()
+    cosine = (rows @ (samples * length).mT).view(size).permute(1, 2, 3, 0, 4).contiguous()
+    sine = (rows @ (tangents * length).mT).view(size).permute(1, 2, 3, 0, 4).contiguous()
     raised = answers.offsets.permute(1, 2, 3, 0).unsqueeze(-1).expand_as(cosine).clone()
     raised[-1] += target.slack.unsqueeze(-1)
     floor = answers.floor.unsqueeze(1)
@@ -186,7 +189,7 @@ def compiled_moves(
         tolerance: of answers without error: gaps this small are ties.
 
     Returns:
-        (S M D), unit vectors.
+        (S M D), each as long as before.
     """
     moved = torch.empty_like(samples, memory_format=torch.contiguous_format)
     given = samples, poles, uniform, rows, offsets, floor, slack, power, moved

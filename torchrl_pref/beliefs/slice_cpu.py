@@ -5,7 +5,8 @@ a call for one session costs a hundredth of one for a hundred. Innermost loops r
 that the processor takes several at once. The first call on a new machine takes some seconds.
 
 A move needs of ω only its return gaps: they turn with ω, and all samples of a group move towards
-one pole, so that a move costs as much for many features as for few.
+one pole, so that a move costs as much for many features as for few. A sample keeps its length,
+which multiplies its gaps.
 
 Shapes: S sessions, M samples, H answers, F factors of an answer, J rows of a factor, D features, V
 moves, P sets of samples that share a pole, U uniforms of a move, G rows of all the answers that a
@@ -20,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from torchrl_pref.compiled import compiled
+from torchrl_pref.tensors import ROUNDING
 
 Array = np.ndarray[Any, np.dtype[Any]]
 
@@ -101,12 +103,14 @@ def _move_session(
 ) -> None:
     """Fill ``moved`` (M D) with where V moves take the samples (M D) of a session."""
     n_samples, n_features = samples.shape
-    places = np.empty((n_features, n_samples))
+    places, lengths = np.empty((n_features, n_samples)), np.ones(n_samples)
     for m in range(n_samples):
         # Of unit length in float64: a circle through the pole nearby is told by the rounding else.
         norm = 0.0
         for d in range(n_features):
             norm += float(samples[m, d]) ** 2
+        if abs(math.sqrt(norm) - 1.0) > ROUNDING:
+            lengths[m] = math.sqrt(norm)
         for d in range(n_features):
             places[d, m] = samples[m, d] / math.sqrt(norm)
     gaps = np.zeros((len(raised), n_samples))
@@ -115,13 +119,15 @@ def _move_session(
             row = rows[g, d]
             for m in range(n_samples):
                 gaps[g, m] += row * places[d, m]
+        for m in range(n_samples):
+            gaps[g, m] *= lengths[m]
     # At an angle on a circle the gaps are circles[0] cos(angle) + circles[1] sin(angle) + raised.
     circles = np.empty((2, len(raised), n_samples))
     for v in range(len(poles)):
         along, height, pole, arcs = _aim(places, poles[v], uniform[v], arc)
         ahead = _products(poles[v], rows)
         circles[0] = gaps
-        _turn_gaps(gaps, circles[1], ahead, along, height)
+        _turn_gaps(gaps, circles[1], ahead, lengths, along, height)
         given = circles, raised, ends, floors, pole, arcs, uniform[v], power, n_features - 2
         turn = _search(*given, hard, tolerance)
         cosine, sine = np.cos(turn), np.sin(turn)
@@ -133,6 +139,8 @@ def _move_session(
             for d in range(n_features):
                 for m in range(first, last):
                     places[d, m] = places[d, m] * cosine[m] + poles[v, p, d] * sine[m]
+            for m in range(first, last):
+                sine[m] *= lengths[m]
             for g in range(len(raised)):
                 for m in range(first, last):
                     gaps[g, m] = gaps[g, m] * cosine[m] + ahead[p, g] * sine[m]
@@ -141,7 +149,7 @@ def _move_session(
         for d in range(n_features):
             norm += places[d, m] * places[d, m]
         for d in range(n_features):
-            moved[m, d] = places[d, m] / math.sqrt(norm)
+            moved[m, d] = places[d, m] / math.sqrt(norm) * lengths[m]
 
 
 @compiled
@@ -162,15 +170,17 @@ def _products(poles: Array, rows: Array) -> Array:
 
 
 @compiled
-def _turn_gaps(gaps: Array, sideways: Array, ahead: Array, along: Array, height: Array) -> None:
-    """Fill ``sideways`` (G M) with the gaps of the tangents, from those of the places (G M) and of
-    the poles (P G)."""
+def _turn_gaps(
+    gaps: Array, sideways: Array, ahead: Array, lengths: Array, along: Array, height: Array
+) -> None:
+    """Fill ``sideways`` (G M) with the gaps of the tangents, from those of the places (G M), of the
+    poles (P G) and the samples' lengths (M)."""
     n_samples = gaps.shape[1]
     for p in range(len(ahead)):
         first, last = _group(p, len(ahead), n_samples)
         for g in range(len(gaps)):
             for m in range(first, last):
-                sideways[g, m] = (ahead[p, g] - along[m] * gaps[g, m]) / height[m]
+                sideways[g, m] = (ahead[p, g] * lengths[m] - along[m] * gaps[g, m]) / height[m]
 
 
 @compiled

@@ -18,7 +18,7 @@ from torchrl_pref.acquisition.functions import information_gain
 from torchrl_pref.acquisition.scoring import score_queries
 from torchrl_pref.beliefs.base import BeliefBase
 from torchrl_pref.errors import InputError
-from torchrl_pref.tensors import check_range
+from torchrl_pref.tensors import check_range, directions
 
 OPEN, REFUSED, LEFT_OUT = -1, -2, -3
 """Marks in a history in the place of an answer: not asked yet; asked, and the person would not say;
@@ -48,7 +48,7 @@ class SessionState(TypedDict):
     samples: Tensor
     """(B M D), the belief."""
     mean: Tensor
-    """(B D), the mean of the samples."""
+    """(B D), the mean direction of the samples."""
     ess: Tensor
     """(B 1), effective sample size of the belief."""
     information: Tensor
@@ -75,7 +75,7 @@ def begin(samples: Tensor, budget: int, n_options: int) -> SessionState:
     open_slots = torch.full((size, budget), OPEN, device=samples.device)
     return {
         "samples": samples,
-        "mean": samples.mean(1),
+        "mean": directions(samples).mean(1),
         "ess": zero + n_samples,
         "information": zero,
         "n_asked": zero.long(),
@@ -147,7 +147,7 @@ def _learn(
     evidence = model.evidence(torch.cat([past, query], 1), torch.cat([given, answers[:, None]], 1))
     update = belief.update(samples, session["ess"].squeeze(-1), evidence, generator)
     gain = score_queries(samples, query, model, information_gain)
-    session["samples"], session["mean"] = update.samples, update.samples.mean(1)
+    session["samples"], session["mean"] = update.samples, directions(update.samples).mean(1)
     session["ess"] = update.ess.unsqueeze(-1)
     session["information"] = session["information"] + gain
     return torch.where(update.used, answers, LEFT_OUT)

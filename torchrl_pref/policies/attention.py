@@ -23,6 +23,7 @@ from torchrl_pref.policies.base import (
     _belief_features,
     belief_summary,
 )
+from torchrl_pref.tensors import directions
 
 WIDTH, HEADS = 32, 4
 
@@ -35,13 +36,14 @@ def belief_tokens(samples: Tensor, kind: str) -> Tensor:
     ``samples`` are all M of them; ``covariance`` keeps mean and covariance, as the 2D + 1 points
     m, m ± √λ v for each eigenvector v of eigenvalue λ; ``mean`` keeps the mean alone.
     """
+    samples = directions(samples)
     if kind == "samples":
         return samples
     mean = samples.mean(1, keepdim=True)
     if kind == "mean":
         return mean
-    variances, directions = torch.linalg.eigh(covariance_of(samples))
-    steps = (directions * variances.clamp(min=0).sqrt().unsqueeze(-2)).mT
+    variances, axes = torch.linalg.eigh(covariance_of(samples))
+    steps = (axes * variances.clamp(min=0).sqrt().unsqueeze(-2)).mT
     return torch.cat([mean, mean + steps, mean - steps], 1)
 
 

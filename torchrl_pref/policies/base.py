@@ -19,6 +19,7 @@ from torchrl.modules import MLP, MaskedCategorical, ProbabilisticActor, ValueOpe
 
 from torchrl_pref.beliefs.resampling import covariance_of
 from torchrl_pref.envs.session import is_feed
+from torchrl_pref.tensors import directions
 
 
 @dataclass(frozen=True)
@@ -150,6 +151,7 @@ class BeliefFeatures(nn.Module):
 
 def belief_summary(samples: Tensor) -> Tensor:
     """Length of the mean and logs of variances (B 4) of samples (B M D)."""
+    samples = directions(samples)
     # Far below any spread of samples on the sphere, far above the rounding of float32.
     variances = torch.linalg.eigvalsh(covariance_of(samples)).clamp(min=1e-8)
     spread = [variances[..., -1], variances.mean(-1), variances[..., 0]]

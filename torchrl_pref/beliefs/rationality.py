@@ -1,0 +1,120 @@
+"""A belief that infers how careful a person is, beside what they want.
+
+Shapes: S sessions, M samples, H answers, F factors of an answer, J rows of a factor, D features, U
+uniforms of a move.
+
+A person's tau is never known. Here it is s times the response model's, with ln s uniform over a
+wide range and independent of ω, and a sample is the vector s ω. Its return gaps are then s times
+those of ω, so that the response model needs no change, and a threshold in logits stays what it is.
+The samples move as those of ``sampled.Belief`` do, each on the sphere of its own length, and then
+along their rays: by slice sampling (Neal, 2003) of ln s, given ω and all answers.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Generator, Tensor
+
+from torchrl_pref.beliefs.sampled import Belief
+from torchrl_pref.beliefs.slice import MAX_SHRINKS, Target
+from torchrl_pref.errors import InputError, check_positive
+from torchrl_pref.questions.response_model import ResponseModel
+from torchrl_pref.questions.responses import Optimal
+from torchrl_pref.tensors import directions
+
+
+class RationalityBelief(Belief):
+    """Posterior samples of tau and ω together.
+
+    Args:
+        response_model: how the belief thinks that people answer; its tau is the middle of what is
+            believed of theirs.
+        spread: a person's tau is believed to be anywhere from the model's over this to the model's
+            times this, each doubling as likely as the next.
+        samples: M, see :class:`Belief`.
+        moves: of ω after each resampling, see :class:`Belief`; one of tau follows.
+
+    Raises:
+        InputError: there is no response model, or one of a human who never errs; or a number is
+            out of its range.
+    """
+
+    def __init__(
+        self,
+        response_model: ResponseModel,
+        spread: float = 16.0,
+        samples: int = 100,
+        moves: int | None = None,
+    ) -> None:
+        super().__init__(response_model, samples, moves)
+        if isinstance(response_model, Optimal):
+            raise InputError(
+                "belief=rationality with a human who never errs: there is no tau to infer; "
+                "expected tau=noisy or a number, or belief=sampled"
+            )
+        self.spread = check_positive("belief.spread", spread)
+        if not 1 < spread <= 1e6:
+            raise InputError(
+                f"belief.spread={spread}: expected a factor above 1, and at most 1e6; "
+                "belief=sampled is for a tau that is known"
+            )
+
+    def prior(self, n_sessions: int, n_features: int, generator: Generator) -> Tensor:
+        """Samples of the prior, (S M D)."""
+        omega = super().prior(n_sessions, n_features, generator)
+        uniform = torch.rand(
+            (n_sessions, self.n_samples, 1), generator=generator, device=generator.device
+        )
+        return omega * self.spread ** (2 * uniform - 1)
+
+    def _move(self, samples: Tensor, target: Target, generator: Generator) -> Tensor:
+        """See :meth:`Belief._move`; and along the rays."""
+        moved = super()._move(samples, target, generator)
+        size = (*moved.shape[:2], 1 + MAX_SHRINKS)
+        uniform = torch.rand(size, generator=generator, device=moved.device)
+        return move_lengths(moved, uniform, target, math.log(self.spread))
+
+
+def move_lengths(samples: Tensor, uniform: Tensor, target: Target, end: float) -> Tensor:
+    """One move of each sample along its ray, which leaves the target invariant.
+
+    Args:
+        samples: (S M D).
+        uniform: (S M U), in [0, 1): one, and one for each shrink.
+        target: the density of the samples, given which log-lengths are uniform.
+        end: log-lengths are from minus this to this.
+
+    Returns:
+        (S M D), along the same rays.
+    """
+    omega = directions(samples)
+    answers = target.answers
+    size = (*answers.rows.shape[:-1], samples.shape[1])
+    # Samples are innermost in memory: every operation below then runs along them.
+    gaps = (answers.rows.flatten(1, -2) @ omega.mT).view(size).permute(1, 2, 3, 0, 4).contiguous()
+    raised = answers.offsets.permute(1, 2, 3, 0).unsqueeze(-1).expand_as(gaps).clone()
+    raised[-1] += target.slack.unsqueeze(-1)
+    floor = answers.floor.unsqueeze(1)
+
+    def log_density(log_length: Tensor) -> Tensor:
+        """(S M), at log-lengths (S M)."""
+        given = torch.addcmul(raised, gaps, log_length.exp()).permute(3, 4, 0, 1, 2)
+        likelihood = target.response_model.joint_log_likelihood(given, floor)
+        return target.power.unsqueeze(-1) * likelihood
+
+    level, *fractions = uniform.unbind(-1)
+    log_length = samples.norm(dim=-1).log().clamp(-end, end)
+    threshold = log_density(log_length) + torch.log1p(-level)
+    threshold = threshold.clamp(min=torch.finfo(threshold.dtype).min)
+    low, high = torch.full_like(log_length, -end), torch.full_like(log_length, end)
+    place, found = log_length, torch.zeros_like(log_length, dtype=torch.bool)
+    for fraction in fractions:
+        proposal = torch.lerp(low, high, fraction)
+        accepted = log_density(proposal) >= threshold
+        place = torch.where(accepted & ~found, proposal, place)
+        found |= accepted
+        ahead = proposal > log_length
+        low, high = torch.where(ahead, low, proposal), torch.where(ahead, proposal, high)
+    return omega * place.exp().unsqueeze(-1)

@@ -55,10 +55,10 @@ class RationalityBelief(Belief):
                 "expected tau=noisy or a number, or belief=sampled"
             )
         self.spread = check_positive("belief.spread", spread)
-        if not 1 < spread <= 1e6:
+        if not 1 <= spread <= 1e6:
             raise InputError(
-                f"belief.spread={spread}: expected a factor above 1, and at most 1e6; "
-                "belief=sampled is for a tau that is known"
+                f"belief.spread={spread}: expected a factor of at least 1, and at most 1e6; 1 is a "
+                "tau that is known"
             )
 
     def prior(self, n_sessions: int, n_features: int, generator: Generator) -> Tensor:

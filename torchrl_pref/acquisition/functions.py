@@ -62,8 +62,8 @@ def alignment_gain(predicted: Prediction, samples: Tensor) -> Tensor:
     .. math:: \sum_q P(q) \, \lVert E[\omega \mid q] \rVert^2 - \lVert E[\omega] \rVert^2
         = \sum_q P(q) \, \lVert E[\omega \mid q] - E[\omega] \rVert^2
 
-    ω is the direction of a sample. :math:`\lVert E[\omega] \rVert^2` is what the belief itself expects of its alignment
-    (the mean cosine between its samples and the human's ω).
+    ω is the direction of a sample. :math:`\lVert E[\omega] \rVert^2` is what the belief itself
+    expects of its alignment (the mean cosine between its samples and the human's ω).
 
     Args:
         predicted: of the answers to C candidates, under M samples.

@@ -7,22 +7,26 @@ A person's tau is never known. Here it is s times the response model's, with ln 
 wide range and independent of ω, and a sample is the vector s ω. Its return gaps are then s times
 those of ω, so that the response model needs no change, and a threshold in logits stays what it is.
 The samples move as those of ``sampled.Belief`` do, each on the sphere of its own length, and then
-along their rays: by slice sampling (Neal, 2003) of ln s, given ω and all answers.
+along their rays: by slice sampling (Neal, 2003) of ln s, given ω and all answers. Where the
+response model has a lapse rate, that is inferred too: see ``lapses.py``.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Generator, Tensor
 
+from torchrl_pref.beliefs.lapses import LapseRates
 from torchrl_pref.beliefs.sampled import Belief
 from torchrl_pref.beliefs.slice import MAX_SHRINKS, Target
 from torchrl_pref.errors import InputError, check_positive
+from torchrl_pref.questions.base import Evidence
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.questions.responses import Optimal
-from torchrl_pref.tensors import directions
+from torchrl_pref.tensors import directions, lengths
 
 
 class RationalityBelief(Belief):
@@ -30,7 +34,7 @@ class RationalityBelief(Belief):
 
     Args:
         response_model: how the belief thinks that people answer; its tau is the middle of what is
-            believed of theirs.
+            believed of theirs, and its lapse rate the mean; 0 is believed for certain.
         spread: a person's tau is believed to be anywhere from the model's over this to the model's
             times this, each doubling as likely as the next.
         samples: M, see :class:`Belief`.
@@ -69,34 +73,62 @@ class RationalityBelief(Belief):
         )
         return omega * self.spread ** (2 * uniform - 1)
 
+    @property
+    def _rates(self) -> LapseRates | None:
+        """What is believed of the lapse rate; None: that there are no lapses."""
+        return LapseRates(self.response_model) if self.response_model.lapse else None
+
+    def _foreseen(self, samples: Tensor, answers: Evidence) -> Tensor:
+        """See :meth:`Belief._foreseen`."""
+        if self._rates is None:
+            return super()._foreseen(samples, answers)
+        return self._rates.raised(samples, answers)(samples.new_zeros(len(samples)))
+
+    def _raised(self, samples: Tensor, answers: Evidence) -> Callable[[Tensor], Tensor]:
+        """See :meth:`Belief._raised`."""
+        if self._rates is None:
+            return super()._raised(samples, answers)
+        return self._rates.raised(samples, answers)
+
+    def _tempered(self, samples: Tensor, answers: Evidence) -> Callable[[Tensor, Tensor], Tensor]:
+        """See :meth:`Belief._tempered`."""
+        if self._rates is None:
+            return super()._tempered(samples, answers)
+        return self._rates.tempered(samples, answers)
+
     def _move(self, samples: Tensor, target: Target, generator: Generator) -> Tensor:
-        """See :meth:`Belief._move`; and along the rays."""
-        moved = super()._move(samples, target, generator)
-        size = (*moved.shape[:2], 1 + MAX_SHRINKS)
-        uniform = torch.rand(size, generator=generator, device=moved.device)
-        return move_lengths(moved, uniform, target, math.log(self.spread))
+        """See :meth:`Belief._move`; and along the rays, all with a lapse rate for each sample."""
+        length = lengths(samples).squeeze(-1)
+        odds = torch.ones_like(length)
+        if self._rates is not None:
+            odds = self._rates.draw(samples, target, generator)
+        target = target._replace(scales=torch.stack([length, odds], 1))
+        omega = super()._move(directions(samples), target, generator)
+        size = (*length.shape, 1 + MAX_SHRINKS)
+        uniform = torch.rand(size, generator=generator, device=length.device)
+        return omega * move_lengths(omega, uniform, target, math.log(self.spread))
 
 
-def move_lengths(samples: Tensor, uniform: Tensor, target: Target, end: float) -> Tensor:
+def move_lengths(omega: Tensor, uniform: Tensor, target: Target, end: float) -> Tensor:
     """One move of each sample along its ray, which leaves the target invariant.
 
     Args:
-        samples: (S M D).
+        omega: (S M D), the samples' directions.
         uniform: (S M U), in [0, 1): one, and one for each shrink.
-        target: the density of the samples, given which log-lengths are uniform.
-        end: log-lengths are from minus this to this.
+        target: the likelihood, with the lengths that the samples have.
+        end: log-lengths are uniform from minus this to this.
 
     Returns:
-        (S M D), along the same rays.
+        (S M 1), the lengths that they get.
     """
-    omega = directions(samples)
-    answers = target.answers
-    size = (*answers.rows.shape[:-1], samples.shape[1])
+    answers, scales = target.answers, target.scales
+    assert scales is not None
+    size = (*answers.rows.shape[:-1], omega.shape[1])
     # Samples are innermost in memory: every operation below then runs along them.
     gaps = (answers.rows.flatten(1, -2) @ omega.mT).view(size).permute(1, 2, 3, 0, 4).contiguous()
     raised = answers.offsets.permute(1, 2, 3, 0).unsqueeze(-1).expand_as(gaps).clone()
     raised[-1] += target.slack.unsqueeze(-1)
-    floor = answers.floor.unsqueeze(1)
+    floor = target.floor()
 
     def log_density(log_length: Tensor) -> Tensor:
         """(S M), at log-lengths (S M)."""
@@ -105,7 +137,7 @@ def move_lengths(samples: Tensor, uniform: Tensor, target: Target, end: float) -
         return target.power.unsqueeze(-1) * likelihood
 
     level, *fractions = uniform.unbind(-1)
-    log_length = samples.norm(dim=-1).log().clamp(-end, end)
+    log_length = scales[:, 0].log().clamp(-end, end)
     threshold = log_density(log_length) + torch.log1p(-level)
     threshold = threshold.clamp(min=torch.finfo(threshold.dtype).min)
     low, high = torch.full_like(log_length, -end), torch.full_like(log_length, end)
@@ -117,4 +149,4 @@ def move_lengths(samples: Tensor, uniform: Tensor, target: Target, end: float) -
         found |= accepted
         ahead = proposal > log_length
         low, high = torch.where(ahead, low, proposal), torch.where(ahead, proposal, high)
-    return omega * place.exp().unsqueeze(-1)
+    return place.exp().unsqueeze(-1)

@@ -27,7 +27,6 @@ from torchrl_pref.compiled import over_sessions
 from torchrl_pref.questions.base import Evidence
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.questions.responses import compiled_constants
-from torchrl_pref.tensors import directions, lengths
 
 ARC = 32.0
 """Length of the arc that is searched, in standard deviations of the posterior along it. A short
@@ -49,11 +48,20 @@ class Target(NamedTuple):
     """(S), to which the likelihood is raised."""
     response_model: ResponseModel
     """The likelihood."""
+    scales: Tensor | None = None
+    """(S 2 M), by what each sample multiplies the returns of its direction, and the answers'
+    floors, which are for lapses; None: 1."""
+
+    def floor(self) -> Tensor:
+        """(S M H) or (S 1 H), of the answers."""
+        floor = self.answers.floor.unsqueeze(1)
+        return floor if self.scales is None else floor * self.scales[:, 1].unsqueeze(-1)
 
     def of(self, sessions: Tensor) -> Target:
         """The same for some of the sessions."""
+        scales = None if self.scales is None else self.scales[sessions]
         some = self.answers[sessions], self.slack[sessions], self.power[sessions]
-        return Target(*some, self.response_model)
+        return Target(*some, self.response_model, scales)
 
 
 def round_of_moves(
@@ -63,8 +71,6 @@ def round_of_moves(
     generator: Generator,
 ) -> Tensor:
     """Move every sample V times, each time along the great circle through it and a pole.
-
-    A sample keeps its length: it moves on a sphere of its own.
 
     The posterior is left invariant if a pole does not depend on the samples that move towards it:
     it is drawn from the spread of the other groups. On a circle the uniform measure of the sphere
@@ -77,7 +83,7 @@ def round_of_moves(
         generator: the source of randomness, on the device of the samples.
 
     Returns:
-        (S M D), each as long as before.
+        (S M D), unit vectors.
     """
     n_sessions, n_samples, n_features = samples.shape
     device = samples.device
@@ -85,11 +91,12 @@ def round_of_moves(
     normal = torch.randn(shape, generator=generator, device=device)
     size = (n_moves, n_sessions, n_samples, 2 + MAX_SHRINKS)
     uniform = torch.rand(size, generator=generator, device=device)
-    poles = poles_of(directions(samples), normal)
+    poles = poles_of(samples, normal)
     constants = compiled_constants(target.response_model)
     if samples.is_cpu and constants is not None:
-        answers, slack, power, _ = target
-        evidence = answers.rows, answers.offsets, answers.floor
+        answers, slack, power, _, scales = target
+        scales = samples.new_ones(n_sessions, 2, n_samples) if scales is None else scales
+        evidence = answers.rows, answers.offsets, answers.floor, scales
         return compiled_moves(samples, poles, uniform, *evidence, slack, power, ARC, *constants)
     return tensor_moves(samples, poles, uniform, target)
 
@@ -98,20 +105,16 @@ def tensor_moves(samples: Tensor, poles: Tensor, uniform: Tensor, target: Target
     """:func:`round_of_moves` in tensors, with poles (V S P D) and uniforms (V S M U) given.
 
     Returns:
-        (S M D), each as long as before.
+        (S M D), unit vectors.
     """
     group = group_of(samples.shape[1], poles.shape[2], samples.device)
-    length, samples = lengths(samples), directions(samples)
     for ahead, luck in zip(poles, uniform, strict=True):
-        samples = _tensor_move(samples, length, ahead[:, group], luck, target)
-    return samples * length
+        samples = _tensor_move(samples, ahead[:, group], luck, target)
+    return samples
 
 
-def _tensor_move(
-    samples: Tensor, length: Tensor, poles: Tensor, uniform: Tensor, target: Target
-) -> Tensor:
-    """One move of unit vectors (S M D), whose gaps count by a length (S M 1), towards a pole each
-    (S M D), with uniforms (S M U).
+def _tensor_move(samples: Tensor, poles: Tensor, uniform: Tensor, target: Target) -> Tensor:
+    """One move of samples (S M D) towards a pole each (S M D), with uniforms (S M U).
 
     Every sample goes through all shrinks, also when it has found its place, so that nothing has
     to be counted and no device is waited for.
@@ -126,11 +129,13 @@ def _tensor_move(
     answers = target.answers
     size = (*answers.rows.shape[:-1], samples.shape[1])
     rows = answers.rows.flatten(1, -2)
-    cosine = (rows @ (samples * length).mT).view(size).permute(1, 2, 3, 0, 4).contiguous()
-    sine = (rows @ (tangents * length).mT).view(size).permute(1, 2, 3, 0, 4).contiguous()
+    cosine = (rows @ samples.mT).view(size).permute(1, 2, 3, 0, 4).contiguous()
+    sine = (rows @ tangents.mT).view(size).permute(1, 2, 3, 0, 4).contiguous()
     raised = answers.offsets.permute(1, 2, 3, 0).unsqueeze(-1).expand_as(cosine).clone()
     raised[-1] += target.slack.unsqueeze(-1)
-    floor = answers.floor.unsqueeze(1)
+    if target.scales is not None:
+        cosine, sine = cosine * target.scales[:, 0], sine * target.scales[:, 0]
+    floor = target.floor()
 
     def log_density(angle: Tensor) -> Tensor:
         """(S M), of the points at an angle (S M) on their circles."""
@@ -170,6 +175,7 @@ def compiled_moves(
     rows: Tensor,
     offsets: Tensor,
     floor: Tensor,
+    scales: Tensor,
     slack: Tensor,
     power: Tensor,
     arc: float,
@@ -183,16 +189,16 @@ def compiled_moves(
         poles: (V S P D).
         uniform: (V S M U), in [0, 1): two, and one for each shrink.
         rows, offsets, floor: (S H F J D), (S H F J) and (S H), see ``questions.base.Evidence``.
-        slack, power: (S), see :class:`Target`.
+        scales, slack, power: (S 2 M), (S) and (S), see :class:`Target`.
         arc: length of the arc that is searched, in lengths of the pole.
         tau: what the gaps are multiplied by; infinite for answers without error.
         tolerance: of answers without error: gaps this small are ties.
 
     Returns:
-        (S M D), each as long as before.
+        (S M D), unit vectors.
     """
     moved = torch.empty_like(samples, memory_format=torch.contiguous_format)
-    given = samples, poles, uniform, rows, offsets, floor, slack, power, moved
+    given = samples, poles, uniform, rows, offsets, floor, scales, slack, power, moved
     arrays = (t.contiguous().numpy() for t in given)
     over_sessions(move_sessions, len(samples), *arrays, arc, tau, tolerance)
     return moved

@@ -5,8 +5,7 @@ a call for one session costs a hundredth of one for a hundred. Innermost loops r
 that the processor takes several at once. The first call on a new machine takes some seconds.
 
 A move needs of ω only its return gaps: they turn with ω, and all samples of a group move towards
-one pole, so that a move costs as much for many features as for few. A sample keeps its length,
-which multiplies its gaps.
+one pole, so that a move costs as much for many features as for few.
 
 Shapes: S sessions, M samples, H answers, F factors of an answer, J rows of a factor, D features, V
 moves, P sets of samples that share a pole, U uniforms of a move, G rows of all the answers that a
@@ -21,7 +20,6 @@ from typing import Any
 import numpy as np
 
 from torchrl_pref.compiled import compiled
-from torchrl_pref.tensors import ROUNDING
 
 Array = np.ndarray[Any, np.dtype[Any]]
 
@@ -36,6 +34,7 @@ def move_sessions(
     rows: Array,
     offsets: Array,
     floor: Array,
+    scales: Array,
     slack: Array,
     power: Array,
     moved: Array,
@@ -49,7 +48,8 @@ def move_sessions(
         unit = 1.0 if hard else tau
         given = _flatten(rows[s], offsets[s], floor[s], float(slack[s]), unit)
         constants = float(power[s]), arc, hard, tolerance
-        _move_session(samples[s], poles[:, s], uniform[:, s], moved[s], *given, *constants)
+        some = samples[s], scales[s], poles[:, s], uniform[:, s], moved[s]
+        _move_session(*some, *given, *constants)
 
 
 @compiled
@@ -89,6 +89,7 @@ def _flatten(
 @compiled
 def _move_session(
     samples: Array,
+    scales: Array,
     poles: Array,
     uniform: Array,
     moved: Array,
@@ -101,16 +102,15 @@ def _move_session(
     hard: bool,
     tolerance: float,
 ) -> None:
-    """Fill ``moved`` (M D) with where V moves take the samples (M D) of a session."""
+    """Fill ``moved`` (M D) with where V moves take the samples (M D) of a session, whose gaps and
+    floors count by ``scales`` (2 M)."""
     n_samples, n_features = samples.shape
-    places, lengths = np.empty((n_features, n_samples)), np.ones(n_samples)
+    places = np.empty((n_features, n_samples))
     for m in range(n_samples):
         # Of unit length in float64: a circle through the pole nearby is told by the rounding else.
         norm = 0.0
         for d in range(n_features):
             norm += float(samples[m, d]) ** 2
-        if abs(math.sqrt(norm) - 1.0) > ROUNDING:
-            lengths[m] = math.sqrt(norm)
         for d in range(n_features):
             places[d, m] = samples[m, d] / math.sqrt(norm)
     gaps = np.zeros((len(raised), n_samples))
@@ -119,17 +119,18 @@ def _move_session(
             row = rows[g, d]
             for m in range(n_samples):
                 gaps[g, m] += row * places[d, m]
-        for m in range(n_samples):
-            gaps[g, m] *= lengths[m]
+    scaled = np.any(scales[0] != 1)
     # At an angle on a circle the gaps are circles[0] cos(angle) + circles[1] sin(angle) + raised.
     circles = np.empty((2, len(raised), n_samples))
     for v in range(len(poles)):
         along, height, pole, arcs = _aim(places, poles[v], uniform[v], arc)
         ahead = _products(poles[v], rows)
         circles[0] = gaps
-        _turn_gaps(gaps, circles[1], ahead, lengths, along, height)
-        given = circles, raised, ends, floors, pole, arcs, uniform[v], power, n_features - 2
-        turn = _search(*given, hard, tolerance)
+        _turn_gaps(gaps, circles[1], ahead, along, height)
+        if scaled:
+            circles *= scales[0]
+        given = circles, raised, ends, floors, scales[1], pole, arcs, uniform[v], power
+        turn = _search(*given, n_features - 2, hard, tolerance)
         cosine, sine = np.cos(turn), np.sin(turn)
         for m in range(n_samples):
             sine[m] /= height[m]
@@ -139,8 +140,6 @@ def _move_session(
             for d in range(n_features):
                 for m in range(first, last):
                     places[d, m] = places[d, m] * cosine[m] + poles[v, p, d] * sine[m]
-            for m in range(first, last):
-                sine[m] *= lengths[m]
             for g in range(len(raised)):
                 for m in range(first, last):
                     gaps[g, m] = gaps[g, m] * cosine[m] + ahead[p, g] * sine[m]
@@ -149,7 +148,7 @@ def _move_session(
         for d in range(n_features):
             norm += places[d, m] * places[d, m]
         for d in range(n_features):
-            moved[m, d] = places[d, m] / math.sqrt(norm) * lengths[m]
+            moved[m, d] = places[d, m] / math.sqrt(norm)
 
 
 @compiled
@@ -170,17 +169,15 @@ def _products(poles: Array, rows: Array) -> Array:
 
 
 @compiled
-def _turn_gaps(
-    gaps: Array, sideways: Array, ahead: Array, lengths: Array, along: Array, height: Array
-) -> None:
-    """Fill ``sideways`` (G M) with the gaps of the tangents, from those of the places (G M), of the
-    poles (P G) and the samples' lengths (M)."""
+def _turn_gaps(gaps: Array, sideways: Array, ahead: Array, along: Array, height: Array) -> None:
+    """Fill ``sideways`` (G M) with the gaps of the tangents, from those of the places (G M) and of
+    the poles (P G)."""
     n_samples = gaps.shape[1]
     for p in range(len(ahead)):
         first, last = _group(p, len(ahead), n_samples)
         for g in range(len(gaps)):
             for m in range(first, last):
-                sideways[g, m] = (ahead[p, g] * lengths[m] - along[m] * gaps[g, m]) / height[m]
+                sideways[g, m] = (ahead[p, g] - along[m] * gaps[g, m]) / height[m]
 
 
 @compiled
@@ -217,6 +214,7 @@ def _search(
     raised: Array,
     ends: Array,
     floors: Array,
+    odds: Array,
     pole: Array,
     arcs: Array,
     uniform: Array,
@@ -228,7 +226,8 @@ def _search(
     """Angles (M) in the slices: proposals on the arcs, which shrink to each one that is refused."""
     n = circles.shape[2]
     turn, angle, cosine, sine = np.zeros(n), np.empty(n), np.ones(n), np.zeros(n)
-    level = _surprise(circles, raised, ends, floors, cosine, sine, hard, tolerance)
+    odds = odds.copy()
+    level = _surprise(circles, raised, ends, floors, odds, cosine, sine, hard, tolerance)
     for m in range(n):
         level[m] = power * level[m] - meridians * _log(abs(pole[1, m]))
         level[m] = min(level[m] - _log(1.0 - uniform[m, 1]), 1e300)  # the impossible stays above
@@ -240,7 +239,7 @@ def _search(
             m = left[j]
             angle[j] = arcs[0, m] + uniform[m, i] * (arcs[1, m] - arcs[0, m])
             cosine[j], sine[j] = math.cos(np.float32(angle[j])), math.sin(np.float32(angle[j]))
-        given = circles, raised, ends, floors, cosine[:n], sine[:n]
+        given = circles, raised, ends, floors, odds, cosine[:n], sine[:n]
         surprise = _surprise(*given, hard, tolerance)
         n_tried, n = n, 0
         for j in range(n_tried):
@@ -254,6 +253,8 @@ def _search(
                 n += 1
         if n == 0:
             break
+        for j in range(n):
+            odds[j] = odds[refused[j]]
         for g in range(len(raised)):
             for j in range(n):
                 circles[0, g, j] = circles[0, g, refused[j]]
@@ -288,6 +289,7 @@ def _surprise(
     raised: Array,
     ends: Array,
     floors: Array,
+    odds: Array,
     cosine: Array,
     sine: Array,
     hard: bool,
@@ -321,7 +323,7 @@ def _surprise(
         if floors[e] > 0:  # the floor is added to what this answer alone is likely
             for j in range(n):
                 alone = total[j] - before[j]
-                total[j] = before[j] - math.log(math.exp(-alone) + floors[e])
+                total[j] = before[j] - math.log(math.exp(-alone) + floors[e] * odds[j])
         if floors[e] >= 0:
             for j in range(n):
                 before[j] = total[j]

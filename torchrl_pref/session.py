@@ -197,6 +197,13 @@ class Session:
         numbers = samples.mean(1), samples.std(1), low, high
         return Weights(*map(self._plain, numbers))
 
+    @property
+    def rationality(self) -> Tensor:
+        """(B 3), what the person's tau is thought to be: the median, and what 5% of the samples are
+        below and above; the response model's own thrice where the belief does not infer it."""
+        tau = self._env.belief.rationality(self._states[-1]["samples"])
+        return self._plain(torch.quantile(tau, tau.new_tensor([0.5, 0.05, 0.95]), dim=1).mT)
+
     def score(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """The reward of trajectories, and how sure that is.
 

@@ -42,7 +42,7 @@ class RationalityBelief(Belief):
 
     Raises:
         InputError: there is no response model, or one of a human who never errs; or a number is
-            out of its range.
+            out of its range, as is a lapse rate of a quarter or more.
     """
 
     def __init__(
@@ -64,6 +64,7 @@ class RationalityBelief(Belief):
                 f"belief.spread={spread}: expected a factor of at least 1, and at most 1e6; 1 is a "
                 "tau that is known"
             )
+        _ = self._rates  # or its lapse rate is refused here
 
     def prior(self, n_sessions: int, n_features: int, generator: Generator) -> Tensor:
         """Samples of the prior, (S M D)."""

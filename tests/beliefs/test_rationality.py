@@ -41,10 +41,10 @@ def let_in(
 @pytest.mark.parametrize("model", MODELS, ids=str)
 def test_calibration(model: Boltzmann, generator: Generator) -> None:
     """Simulation-based calibration of ω and ln tau, for people whom the prior itself makes."""
-    sessions, n_answers, spread = 800, 8, 16.0
+    sessions, n_answers, spread = 500, 6, 5.0
     belief = RationalityBelief(model, spread, samples=99)
     omega = uniform_sphere((sessions, 3), generator)
-    log_s = (2 * torch.rand(sessions, generator=generator) - 1) * math.log(spread)
+    log_s = torch.randn(sessions, generator=generator) * math.log(spread)
     rates = model.lapse * torch.tensor(RATES)
     shares = torch.tensor(SHARES)
     rate = rates[shares.multinomial(sessions, replacement=True, generator=generator)][:, None]
@@ -68,13 +68,13 @@ def reference(
     rng = np.random.default_rng(0)
     omega = rng.standard_normal((draws, options.shape[-1]))
     omega /= np.linalg.norm(omega, axis=1, keepdims=True)
-    log_s = rng.uniform(-np.log(spread), np.log(spread), draws)
+    log_s = rng.normal(0, np.log(spread), draws)
     rate = model.lapse * rng.choice(RATES, draws, p=SHARES)
     log_weights = np.zeros(draws)
     for shown, answer in zip(options.double().numpy(), answers.tolist(), strict=True):
         lead = (shown[answer] - shown[1 - answer]) @ omega.T
         sincere = np.exp(-np.logaddexp(0, -model.tau * np.exp(log_s) * lead))
-        log_weights += np.log((1 - rate) * sincere + rate / 2)
+        log_weights += np.log((1 - rate) * sincere + rate / 2 + 1e-300)
     weights = np.exp(log_weights - log_weights.max())
     weights /= weights.sum()
     assert 1 / np.square(weights).sum() > 3000
@@ -93,7 +93,7 @@ def test_samples_agree_with_importance_sampling(
     answers = (options @ uniform_sphere((3,), generator)).argmax(-1)
     if turned:
         options[6:], answers[6:] = 2 * options[:3], 1 - answers[:3]
-    mean, variance = reference(options, answers, model, 16.0)
+    mean, variance = reference(options, answers, model, 3.0)
     sessions = 150
     shown = options.expand(sessions, -1, -1, -1), answers.expand(sessions, -1)
     samples = let_in(RationalityBelief(model), *shown, generator)

@@ -3,8 +3,8 @@
 Shapes: S sessions, M samples, H answers, F factors of an answer, J rows of a factor, D features, U
 uniforms of a move.
 
-A person's tau is never known. Here it is s times the response model's, with ln s uniform over a
-wide range and independent of ω, and a sample is the vector s ω. Its return gaps are then s times
+A person's tau is never known. Here it is s times the response model's, with ln s normal and
+independent of ω, and a sample is the vector s ω. Its return gaps are then s times
 those of ω, so that the response model needs no change, and a threshold in logits stays what it is.
 The samples move as those of ``sampled.Belief`` do, each on the sphere of its own length, and then
 along their rays: by slice sampling (Neal, 2003) of ln s, given ω and all answers. Where the
@@ -28,6 +28,9 @@ from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.questions.responses import Optimal
 from torchrl_pref.tensors import directions, lengths
 
+FARTHEST = 4.0
+"""Standard deviations of ln s that are thought possible."""
+
 
 class RationalityBelief(Belief):
     """Posterior samples of tau and ω together.
@@ -35,8 +38,8 @@ class RationalityBelief(Belief):
     Args:
         response_model: how the belief thinks that people answer; its tau is the middle of what is
             believed of theirs, and its lapse rate the mean; 0 is believed for certain.
-        spread: a person's tau is believed to be anywhere from the model's over this to the model's
-            times this, each doubling as likely as the next.
+        spread: the factor by which people's tau differs from the model's, either way: two in three
+            are within it, and 19 in 20 within its square.
         samples: M, see :class:`Belief`.
         moves: of ω after each resampling, see :class:`Belief`; one of tau follows.
 
@@ -48,7 +51,7 @@ class RationalityBelief(Belief):
     def __init__(
         self,
         response_model: ResponseModel,
-        spread: float = 16.0,
+        spread: float = 3.0,
         samples: int = 100,
         moves: int | None = None,
     ) -> None:
@@ -69,10 +72,10 @@ class RationalityBelief(Belief):
     def prior(self, n_sessions: int, n_features: int, generator: Generator) -> Tensor:
         """Samples of the prior, (S M D)."""
         omega = super().prior(n_sessions, n_features, generator)
-        uniform = torch.rand(
+        normal = torch.randn(
             (n_sessions, self.n_samples, 1), generator=generator, device=generator.device
         )
-        return omega * self.spread ** (2 * uniform - 1)
+        return omega * self.spread ** normal.clamp(-FARTHEST, FARTHEST)
 
     @property
     def _rates(self) -> LapseRates | None:
@@ -110,14 +113,14 @@ class RationalityBelief(Belief):
         return omega * move_lengths(omega, uniform, target, math.log(self.spread))
 
 
-def move_lengths(omega: Tensor, uniform: Tensor, target: Target, end: float) -> Tensor:
+def move_lengths(omega: Tensor, uniform: Tensor, target: Target, deviation: float) -> Tensor:
     """One move of each sample along its ray, which leaves the target invariant.
 
     Args:
         omega: (S M D), the samples' directions.
         uniform: (S M U), in [0, 1): one, and one for each shrink.
         target: the likelihood, with the lengths that the samples have.
-        end: log-lengths are uniform from minus this to this.
+        deviation: of log-lengths before any answer.
 
     Returns:
         (S M 1), the lengths that they get.
@@ -135,8 +138,10 @@ def move_lengths(omega: Tensor, uniform: Tensor, target: Target, end: float) -> 
         """(S M), at log-lengths (S M)."""
         given = torch.addcmul(raised, gaps, log_length.exp()).permute(3, 4, 0, 1, 2)
         likelihood = target.response_model.joint_log_likelihood(given, floor)
-        return target.power.unsqueeze(-1) * likelihood
+        prior = -(log_length / deviation).square() / 2
+        return prior + target.power.unsqueeze(-1) * likelihood
 
+    deviation, end = max(deviation, 1e-6), FARTHEST * deviation
     level, *fractions = uniform.unbind(-1)
     log_length = scales[:, 0].log().clamp(-end, end)
     threshold = log_density(log_length) + torch.log1p(-level)

@@ -102,6 +102,7 @@ def test_samples_agree_with_importance_sampling(
     sd = np.sqrt(variance)
     error = values.mean(1).std(0) / math.sqrt(sessions) / sd
     assert (np.abs(values.mean((0, 1)) - mean) / sd < 0.03 + 4 * error).all()
+    assert (error**2 < 1 / 50 / sessions).all()  # the samples are worth at least 50 of their 100
     assert np.abs(np.square(values - mean).mean((0, 1)) / variance - 1).max() < 0.08
 
 

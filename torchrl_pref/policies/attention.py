@@ -36,7 +36,6 @@ def belief_tokens(samples: Tensor, kind: str) -> Tensor:
     ``samples`` are all M of them; ``covariance`` keeps mean and covariance, as the 2D + 1 points
     m, m ± √λ v for each eigenvector v of eigenvalue λ; ``mean`` keeps the mean alone.
     """
-    samples = directions(samples)
     if kind == "samples":
         return samples
     mean = samples.mean(1, keepdim=True)
@@ -73,7 +72,7 @@ class AttentionScorer(nn.Module):
         candidates, options = queries.shape[1:3]
         centred = queries - queries.mean(-2, keepdim=True)
         shown = self.option(centred.flatten(1, 2))
-        keys, values = self.point(belief_tokens(samples, self.tokens)).chunk(2, -1)
+        keys, values = self.point(belief_tokens(directions(samples), self.tokens)).chunk(2, -1)
         split = [part.unflatten(-1, (HEADS, -1)).transpose(1, 2) for part in (shown, keys, values)]
         seen = F.scaled_dot_product_attention(*split).transpose(1, 2).flatten(2)
         shares = shares.unsqueeze(1).expand(-1, seen.shape[1], -1)

@@ -146,12 +146,11 @@ class BeliefFeatures(nn.Module):
 
     def forward(self, samples: Tensor, remaining: Tensor) -> Tensor:
         """From samples (B M D) and shares (B 1 or 2) to features (B G)."""
-        return torch.cat([remaining, self.summary(samples)], -1)
+        return torch.cat([remaining, self.summary(directions(samples))], -1)
 
 
 def belief_summary(samples: Tensor) -> Tensor:
     """Length of the mean and logs of variances (B 4) of samples (B M D)."""
-    samples = directions(samples)
     # Far below any spread of samples on the sphere, far above the rounding of float32.
     variances = torch.linalg.eigvalsh(covariance_of(samples)).clamp(min=1e-8)
     spread = [variances[..., -1], variances.mean(-1), variances[..., 0]]

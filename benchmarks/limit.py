@@ -130,6 +130,7 @@ def _moving(model: ResponseModel, n_answers: int, repeats: int) -> common.Row:
         gaps = torch.cat([gaps, newest.unsqueeze(1)], 1)
     normal = torch.randn((SESSIONS, FRAMES, MOVES, pool.shape[-1]), generator=generator)
     slack, power = torch.zeros(SESSIONS), torch.ones(SESSIONS)
+    scales = torch.ones(SESSIONS, 2, samples.shape[1])
     uniform = torch.rand((MOVES, *samples.shape[:2], 2 + MAX_SHRINKS), generator=generator)
     constants = compiled_constants(model)
     assert constants is not None
@@ -138,7 +139,7 @@ def _moving(model: ResponseModel, n_answers: int, repeats: int) -> common.Row:
         poles = poles_of(samples, normal[:, :, :moves])
         luck = uniform[:moves, ..., : 2 + shrinks]
         evidence = told(gaps[:, :-1], gaps[:, -1])
-        given = evidence.rows, evidence.offsets, evidence.floor, slack, power
+        given = evidence.rows, evidence.offsets, evidence.floor, scales, slack, power
         return compiled_moves(samples, poles, luck, *given, ARC, *constants)
 
     # A sample that has not moved after so many shrinks needs one more evaluation.

@@ -31,6 +31,7 @@ ORDER = [
     "training",
     "pretrained",
     "saved_session",
+    "asking",
     "session",
     "sweeps",
 ]

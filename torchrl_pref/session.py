@@ -10,17 +10,16 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
-from tensordict.nn import TensorDictModuleBase
 from torch import Generator, Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from torchrl_pref.asking import strategy_of
 from torchrl_pref.beliefs.base import BeliefBase
 from torchrl_pref.beliefs.sampled import Belief
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.envs.transition import begin, hear, tell
 from torchrl_pref.errors import (
     InputError,
-    check_choice,
     check_count,
     check_flag,
     check_seed,
@@ -33,8 +32,8 @@ from torchrl_pref.questions.base import answers_on
 from torchrl_pref.questions.prior_evidence import Shown, given_digest, rows_of_shown
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.saved_session import FORMAT, check_content
-from torchrl_pref.strategies import STRATEGIES, MakeStrategy
-from torchrl_pref.tensors import check_finite, check_plain
+from torchrl_pref.strategies import MakeStrategy
+from torchrl_pref.tensors import check_finite, check_plain, directions
 
 PRIME = 1_000_003
 """Between the seeds of two sessions there is room for so many answers."""
@@ -130,7 +129,7 @@ class Session:
         self._env = QueryEnv(
             self.pool, human, belief, budget, repeats=repeats, batch_size=size, seed=seed
         )
-        self._strategy = _made(strategy, self._env)
+        self._strategy = strategy_of(strategy, self._env)
         luck, n_features = Generator().manual_seed(self.seed), self.pool.n_features
         state = begin(belief.prior(size[0], n_features, luck), budget, self.pool.n_options)
         if given:
@@ -209,11 +208,18 @@ class Session:
 
     @property
     def weights(self) -> Weights:
-        """What is known of the weights."""
-        samples = self._states[-1]["samples"]
+        """What is known of the weights: of their directions."""
+        samples = directions(self._states[-1]["samples"])
         low, high = torch.quantile(samples, samples.new_tensor([0.05, 0.95]), dim=1)
         mean, sd, low, high = map(self._plain, (samples.mean(1), samples.std(1), low, high))
         return Weights(mean, sd, low, high, self.pool.feature_names)
+
+    @property
+    def rationality(self) -> Tensor:
+        """(B 3), what the person's tau is thought to be: the median, and what 5% of the samples are
+        below and above; the response model's own thrice where the belief does not infer it."""
+        tau = self._env.belief.rationality(self._states[-1]["samples"])
+        return self._plain(torch.quantile(tau, tau.new_tensor([0.5, 0.05, 0.95]), dim=1).mT)
 
     def score(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """The reward of trajectories, and how sure that is.
@@ -234,7 +240,7 @@ class Session:
             raise InputError(
                 f"features of shape {tuple(features.shape)}: expected (n, {self.pool.n_features})"
             )
-        rewards = self._states[-1]["samples"] @ features.mT
+        rewards = directions(self._states[-1]["samples"]) @ features.mT
         return self._plain(rewards.mean(1)), self._plain(rewards.std(1))
 
     def to_dict(self) -> dict[str, Any]:
@@ -340,22 +346,3 @@ class Session:
     def _plain(self, tensor: Tensor) -> Tensor:
         """Without the leading B where there is one person."""
         return tensor[0] if self.people is None else tensor
-
-
-def _made(strategy: str | MakeStrategy, env: QueryEnv) -> TensorDictModuleBase:
-    """What asks, in an environment."""
-    if strategy == "policy":
-        from torchrl_pref.pretrained import pretrained_policy  # and all that it takes
-
-        kind = "noisy" if env.belief.response_model.is_soft else "optimal"
-        return pretrained_policy(env, kind).strategy
-    if isinstance(strategy, str):
-        return STRATEGIES[check_choice("strategy", strategy, (*STRATEGIES, "policy"))](env)
-    if not callable(strategy) or isinstance(strategy, TensorDictModuleBase):
-        raise InputError(
-            f"strategy of type {type(strategy).__name__}: expected a function from an environment "
-            "to a module that writes action, such as lambda env: Greedy(env.belief.response_model)"
-        )
-    made = strategy(env)
-    check_type("what strategy makes of an environment", made, TensorDictModuleBase, "Greedy(…)")
-    return made

@@ -9,12 +9,27 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from torchrl_pref.errors import InputError
 
 LONGEST_NAME = 100
 """Letters of a feature's name."""
+
+ROUNDING = 1e-5
+"""A vector whose length is this near to 1 is of length 1."""
+
+
+def lengths(vectors: Tensor) -> Tensor:
+    """Lengths (… 1) of vectors (… D): exactly 1 of those that are of length 1 but for rounding."""
+    length = torch.linalg.vector_norm(vectors, dim=-1, keepdim=True)
+    return torch.where((length - 1).abs() <= ROUNDING, 1.0, length)
+
+
+def directions(vectors: Tensor) -> Tensor:
+    """Unit vectors (… D) along vectors (… D): themselves, to the last bit, where they are such."""
+    return vectors / lengths(vectors).clamp(min=1e-30)
 
 
 def check_plain(name: str, tensor: Any) -> Tensor:

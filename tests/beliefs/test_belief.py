@@ -271,7 +271,9 @@ def test_ties_are_no_surprise_to_a_human_who_never_errs(generator: Generator) ->
 
 def test_however_sharp_the_likelihood_a_stage_keeps_enough(generator: Generator) -> None:
     likelihood = -1e13 * torch.rand(40, 100, generator=generator)
-    power = Belief(Boltzmann(4.5))._next_power(likelihood, torch.zeros(40))
+    power = Belief(Boltzmann(4.5))._next_power(
+        lambda now, to: (to - now).unsqueeze(-1) * likelihood, torch.zeros(40)
+    )
     assert (power > 0).all()
     assert (kish_share(power.unsqueeze(1) * likelihood) > RESTART_SHARE - 0.01).all()
 

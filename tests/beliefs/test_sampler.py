@@ -57,7 +57,7 @@ def test_compiled_moves_go_where_those_in_tensors_do(
             target = Target(answers, slack, torch.full((sessions,), power), model)
             constants = compiled_constants(model)
             assert constants is not None
-            evidence = answers.rows, answers.offsets, answers.floor
+            evidence = answers.rows, answers.offsets, answers.floor, torch.ones(sessions, 2, 100)
             given = *evidence, *target[1:3], ARC, *constants
             compiled = compiled_moves(samples, poles, uniform, *given)
             close = (compiled - tensor_moves(samples, poles, uniform, target)).norm(dim=-1) < 1e-3

@@ -7,6 +7,7 @@ from conftest import RESPONSE_MODELS
 from helpers import coin, make, session_of
 from reference import answer_probs
 from torch import Generator
+from torch.nn import functional as F
 
 from torchrl_pref.beliefs.sampled import Belief
 from torchrl_pref.envs.feed import FeedEnv
@@ -138,12 +139,13 @@ def test_entropy_falls_by_a_bit_for_a_halved_interval() -> None:
 
 
 def test_entropy_is_told_by_the_distance_to_the_third_nearest(generator: Generator) -> None:
-    samples = torch.randn(2, 30, 4, generator=generator)
+    samples = F.normalize(torch.randn(2, 30, 4, generator=generator), dim=-1)
     expected = []
     for each in samples.double().numpy():
         distances = np.linalg.norm(each[:, None] - each, axis=-1)
         third = np.sort(distances, axis=1)[:, 3]  # the nearest of all is the sample itself
         expected.append(-3 * np.log2(third).mean())
+    samples = 3 * samples  # their lengths are no part of ω
     potential = make_objective("entropy").potential({"samples": samples}, {})  # type: ignore[arg-type]
     assert potential.squeeze(-1).tolist() == pytest.approx(expected, abs=1e-4)
 

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchrl_pref.questions.response_model import Prediction
+from torchrl_pref.tensors import directions
 
 Acquisition = Callable[[Prediction, Tensor], Tensor]
 """From what M belief samples (B M D) predict of the answers to C candidates to values (B C …)."""
@@ -61,16 +62,17 @@ def alignment_gain(predicted: Prediction, samples: Tensor) -> Tensor:
     .. math:: \sum_q P(q) \, \lVert E[\omega \mid q] \rVert^2 - \lVert E[\omega] \rVert^2
         = \sum_q P(q) \, \lVert E[\omega \mid q] - E[\omega] \rVert^2
 
-    For unit ω, :math:`\lVert E[\omega] \rVert^2` is what the belief itself expects of its alignment
-    (the mean cosine between its samples and the human's ω).
+    ω is the direction of a sample. :math:`\lVert E[\omega] \rVert^2` is what the belief itself
+    expects of its alignment (the mean cosine between its samples and the human's ω).
 
     Args:
         predicted: of the answers to C candidates, under M samples.
         samples: (… M D), the belief samples.
 
     Returns:
-        (… C), from 0 to 1 - ‖E[ω]‖² for unit samples.
+        (… C), from 0 to 1 - ‖E[ω]‖².
     """
+    samples = directions(samples)
     # About the mean: a small gain would drown in the rounding of two squares near 1.
     centred = samples - samples.mean(-2, keepdim=True)
     moved = torch.einsum("...md,...cmr->...cdr", centred, predicted.probs) / samples.shape[-2]

@@ -18,6 +18,7 @@ import numpy as np
 from torch import Tensor
 
 from torchrl_pref.compiled import compiled, over_sessions
+from torchrl_pref.tensors import ROUNDING
 
 Array = np.ndarray[Any, np.dtype[Any]]
 
@@ -70,6 +71,7 @@ def _score_sessions(
     hard = math.isinf(tau)
     unit = 1.0 if hard else tau  # leads are in units of 1/tau
     centred = np.zeros(((n_features + 3) // 4 * 4, n_samples), np.float32)
+    turned, lengths = np.zeros_like(centred), np.ones(n_samples)
     mean = np.zeros(n_features)
     leads = np.zeros((n_options, len(centred)), np.float32)
     returns = np.zeros((n_options, n_samples), np.float32)
@@ -77,13 +79,12 @@ def _score_sessions(
     scratch = np.empty((3, n_samples), np.float32)
     sums, left = np.empty(n_options), np.empty(len(centred))
     for s in range(first, last):
-        for d in range(n_features):
-            mean[d] = 0.0
-            for m in range(n_samples):
-                mean[d] += samples[s, m, d]
-            mean[d] /= n_samples
-            for m in range(n_samples):
-                centred[d, m] = samples[s, m, d] - mean[d]
+        pointed = centred
+        if _measure(samples[s], lengths):
+            pointed = turned
+            _centre(samples[s], lengths, mean, pointed)
+            lengths[:] = 1.0
+        _centre(samples[s], lengths, mean, centred)
         shown = queries[min(s, len(queries) - 1)]
         for c in range(len(shown)):
             alike = True
@@ -105,7 +106,33 @@ def _score_sessions(
             else:
                 returns[-1] = ZERO
                 bits = _answer(returns, probs, sums, scratch)
-            scores[s, c] = _gains(probs, sums, bits, centred, left)
+            scores[s, c] = _gains(probs, sums, bits, pointed, left)
+
+
+@compiled
+def _measure(samples: Array, lengths: Array) -> bool:
+    """Fill ``lengths`` (M) with those of samples (M D); whether one is not 1 but for rounding."""
+    differ = False
+    for m in range(len(samples)):
+        square = 0.0
+        for d in range(samples.shape[1]):
+            square += float(samples[m, d]) ** 2
+        lengths[m] = math.sqrt(square)
+        differ = differ or abs(lengths[m] - 1.0) > ROUNDING
+        lengths[m] = lengths[m] if abs(lengths[m] - 1.0) > ROUNDING else 1.0
+    return differ
+
+
+@compiled
+def _centre(samples: Array, lengths: Array, mean: Array, centred: Array) -> None:
+    """Fill ``centred`` (P M) with samples (M D) over lengths (M) less their ``mean`` (D)."""
+    for d in range(samples.shape[1]):
+        mean[d] = 0.0
+        for m in range(len(samples)):
+            mean[d] += samples[m, d] / lengths[m]
+        mean[d] /= len(samples)
+        for m in range(len(samples)):
+            centred[d, m] = samples[m, d] / lengths[m] - mean[d]
 
 
 @compiled

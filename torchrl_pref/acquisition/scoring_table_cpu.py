@@ -19,6 +19,7 @@ from torch import Tensor
 
 from torchrl_pref.compiled import compiled, over_sessions
 from torchrl_pref.questions.base import Factors
+from torchrl_pref.tensors import directions
 
 Array = np.ndarray[Any, np.dtype[Any]]
 
@@ -69,7 +70,8 @@ def compiled_table_scores(
     shared = queries[:1] if queries.stride(0) == 0 else queries
     unit = 1.0 if math.isinf(tau) else tau
     tables = factors.contrasts, factors.offsets * (unit / scale), factors.of_answer, log_weights
-    arrays = [t.detach().contiguous().numpy() for t in (samples, shared, scores, *tables)]
+    given = samples, directions(samples), shared, scores, *tables
+    arrays = [t.detach().contiguous().numpy() for t in given]
     constants = unit, math.isinf(tau), np.float32(tolerance)
     over_sessions(_score_sessions, len(samples), *arrays, *constants)
     return scores
@@ -80,6 +82,7 @@ def _score_sessions(
     first: int,
     last: int,
     samples: Array,
+    pointed: Array,
     queries: Array,
     scores: Array,
     contrasts: Array,
@@ -90,7 +93,8 @@ def _score_sessions(
     hard: bool,
     tolerance: float,
 ) -> None:
-    """Fill ``scores`` (S C 3); there are queries (1 C K D) for all or (S C K D) for each."""
+    """Fill ``scores`` (S C 3); there are queries (1 C K D) for all or (S C K D) for each. Samples
+    are ``pointed`` (S M D) where their directions count."""
     n_samples, n_features = samples.shape[1:]
     n_options, n_factors = queries.shape[2], len(contrasts)
     centred = np.empty((n_features, n_samples), np.float32)
@@ -105,9 +109,9 @@ def _score_sessions(
             mean = 0.0
             for m in range(n_samples):
                 plain[d, m] = samples[s, m, d]
-                mean += samples[s, m, d]
+                mean += pointed[s, m, d]
             for m in range(n_samples):
-                centred[d, m] = samples[s, m, d] - mean / n_samples
+                centred[d, m] = pointed[s, m, d] - mean / n_samples
         shown = queries[min(s, len(queries) - 1)]
         for c in range(len(shown)):
             _fill_returns(shown[c], plain, returns, unit)

@@ -12,6 +12,7 @@ from torch import Generator, Tensor
 
 from torchrl_pref.questions.base import Evidence
 from torchrl_pref.questions.response_model import ResponseModel
+from torchrl_pref.tensors import lengths
 
 
 class Update(NamedTuple):
@@ -26,7 +27,12 @@ class Update(NamedTuple):
 
 
 class BeliefBase(ABC):
-    """What is known of the weights ω of S people: M equally likely unit vectors for each.
+    """What is known of S people: M equally likely samples (S M D) for each.
+
+    The direction of a sample is ω (:func:`torchrl_pref.tensors.directions`). Its length says how
+    many times more careful than the response model the person is: 1 in a belief that infers ω
+    alone. The product with features so is the return that the response model expects, and whoever
+    wants ω itself takes directions.
 
     Attributes:
         response_model: how the belief thinks that people answer.
@@ -39,6 +45,10 @@ class BeliefBase(ABC):
     def __repr__(self) -> str:
         numbers = (f"{k}={v}" for k, v in vars(self).items() if k != "response_model")
         return f"{type(self).__name__}({', '.join(numbers)})"
+
+    def rationality(self, samples: Tensor) -> Tensor:
+        """What samples (S M D) hold tau to be, (S M): their lengths times the model's scale."""
+        return lengths(samples).squeeze(-1) * self.response_model.scale
 
     @abstractmethod
     def prior(self, n_sessions: int, n_features: int, generator: Generator) -> Tensor:

@@ -20,7 +20,12 @@ from torch import Generator, Tensor
 from torch.nn import functional as F
 
 from torchrl_pref.beliefs.base import BeliefBase, Update
-from torchrl_pref.beliefs.resampling import kish_share, resample
+from torchrl_pref.beliefs.resampling import (
+    explained_share,
+    furthest,
+    kish_share,
+    resample,
+)
 from torchrl_pref.beliefs.slice import Target, round_of_moves
 from torchrl_pref.config.memory import default_moves
 from torchrl_pref.errors import check_count, check_type
@@ -174,7 +179,7 @@ class Belief(BeliefBase):
             Samples (S M D), inflation (S), and that the answer was used (S).
         """
         model = self.response_model
-        log_weights = self._likelihood(samples, answers[:, -1])
+        log_weights = self._foreseen(samples, answers)
         target = Target(answers, torch.zeros_like(inflation), torch.ones_like(inflation), model)
         after = self._resample_move(samples, inflation, log_weights, target, generator)
         return *after, torch.ones_like(inflation, dtype=torch.bool)
@@ -195,16 +200,15 @@ class Belief(BeliefBase):
         for stage in range(MAX_STAGES):
             if todo.numel() == 0:
                 break
-            newest = answers[todo, -1]
-            gaps, floor = newest.gaps(samples[todo]), newest.floor.unsqueeze(1)
-            log_now = self._log_raised(gaps, floor, slack[todo])
-            next_slack = self._next_slack(gaps, floor, slack[todo], log_now)
+            raised = self._raised(samples[todo], answers[todo])
+            log_now = raised(slack[todo])
+            next_slack = self._next_slack(samples[todo], answers[todo], slack[todo], log_now)
             if stage == MAX_STAGES - 1:
                 # Better a few copies than no answer: only an impossible one is left out.
-                possible = self._log_raised(gaps, floor, torch.zeros_like(next_slack)) > -math.inf
+                possible = raised(torch.zeros_like(next_slack)) > -math.inf
                 next_slack = torch.where(possible.any(1), 0.0, next_slack)
             slack[todo] = next_slack
-            log_weights = self._log_weights(gaps, floor, next_slack, log_now)
+            log_weights = _ratio(raised(next_slack), log_now)
             target = Target(answers[todo], next_slack, torch.ones_like(next_slack), model)
             given = samples[todo], inflation[todo], log_weights, target, generator
             samples[todo], inflation[todo] = self._resample_move(*given)
@@ -234,55 +238,69 @@ class Belief(BeliefBase):
         for stage in range(RESTART_STAGES):
             if todo.numel() == 0:
                 break
-            likelihood = self._likelihood(samples[todo], answers[todo])
+            tempered = self._tempered(samples[todo], answers[todo])
             now = power[todo]
-            next_power = self._next_power(likelihood, now)
+            next_power = self._next_power(tempered, now)
             if stage == RESTART_STAGES - 1:
                 next_power = torch.ones_like(now)
             power[todo] = next_power
-            log_weights = (next_power - now).unsqueeze(1) * likelihood
+            log_weights = tempered(now, next_power)
             target = Target(answers[todo], torch.zeros_like(now), next_power, model)
             given = samples[todo], inflation[todo], log_weights, target, generator
             samples[todo], inflation[todo] = self._resample_move(*given)
             todo = todo[next_power < 1]
         return samples, inflation, torch.ones_like(power, dtype=torch.bool)
 
-    def _next_power(self, likelihood: Tensor, power: Tensor) -> Tensor:
-        """(S), the largest power of the likelihood (S M) that keeps enough samples effective."""
+    def _next_power(self, tempered: Callable[[Tensor, Tensor], Tensor], power: Tensor) -> Tensor:
+        """(S), the largest power of the likelihood that keeps enough samples effective."""
+        likelihood = tempered(torch.zeros_like(power), torch.ones_like(power))
         # By this much no weight becomes more than twice another.
         spread = (likelihood.amax(1) - likelihood.amin(1)).clamp(min=1e-20)
-        return _furthest(
+        return furthest(
             (power + math.log(2) / spread).clamp(max=1),
             torch.ones_like(power),
-            lambda to: kish_share((to - power).unsqueeze(-1) * likelihood) >= RESTART_SHARE,
+            lambda to: kish_share(tempered(power, to)) >= RESTART_SHARE,
         )
 
-    def _log_raised(self, gaps: Tensor, floor: Tensor, slack: Tensor) -> Tensor:
-        """(… S M), of one answer with gaps (S M F J) raised by slack (… S) and a floor (S 1);
-        infinite slack gives 0."""
-        raised = gaps + slack.nan_to_num(posinf=0.0)[..., None, None, None]
-        log_likelihood = self.response_model.answer_log_likelihood(raised, floor)
-        return log_likelihood.masked_fill(slack.isinf()[..., None], 0.0)
+    def _foreseen(self, samples: Tensor, answers: Evidence) -> Tensor:
+        """(S M), log-likelihood of the last of answers (S H) under samples (S M D) of the belief
+        after the others."""
+        return self._likelihood(samples, answers[:, -1])
 
-    def _log_weights(self, gaps: Tensor, floor: Tensor, slack: Tensor, log_now: Tensor) -> Tensor:
-        """(… S M), of samples with log-likelihoods (S M) when an answer's slack becomes this
-        (… S)."""
-        # By rounding a sample may lie just outside of where it was moved to, and is dropped.
-        lowest = torch.finfo(log_now.dtype).min
-        return self._log_raised(gaps, floor, slack) - log_now.clamp(min=lowest)
+    def _raised(self, samples: Tensor, answers: Evidence) -> Callable[[Tensor], Tensor]:
+        """From a slack (… S) to :meth:`_foreseen` (… S M) of gaps that are raised by it; infinite
+        slack gives 0."""
+        newest = answers[:, -1]
+        gaps, floor = newest.gaps(samples), newest.floor.unsqueeze(1)
 
-    def _next_slack(self, gaps: Tensor, floor: Tensor, slack: Tensor, log_now: Tensor) -> Tensor:
-        """(S), the smallest slack that keeps enough of the samples effective."""
+        def raised(slack: Tensor) -> Tensor:
+            more = gaps + slack.nan_to_num(posinf=0.0)[..., None, None, None]
+            log_likelihood = self.response_model.answer_log_likelihood(more, floor)
+            return log_likelihood.masked_fill(slack.isinf()[..., None], 0.0)
+
+        return raised
+
+    def _tempered(self, samples: Tensor, answers: Evidence) -> Callable[[Tensor, Tensor], Tensor]:
+        """From two powers (… S) to by how much the log-density of samples (S M D) is higher where
+        the likelihood of answers (S H) is raised to the second (… S M)."""
+        likelihood = self._likelihood(samples, answers)
+        return lambda now, to: (to - now).unsqueeze(-1) * likelihood
+
+    def _next_slack(
+        self, samples: Tensor, answers: Evidence, slack: Tensor, log_now: Tensor
+    ) -> Tensor:
+        """(S), the smallest slack that keeps enough of samples (S M D) effective."""
         result = torch.zeros_like(slack)
-        few = kish_share(self._log_weights(gaps, floor, result, log_now)) < MIN_SHARE
+        few = kish_share(_ratio(self._raised(samples, answers)(result), log_now)) < MIN_SHARE
         if few.any():
-            gaps, floor, log_now = gaps[few], floor[few], log_now[few]
+            raised, log_now = self._raised(samples[few], answers[few]), log_now[few]
             # At this slack every sample agrees, so no factor of the answer tells them far apart.
+            gaps = answers[few, -1].gaps(samples[few])
             start = torch.minimum(slack[few], (-gaps).amax((1, 2, 3)).clamp(min=0))
-            result[few] = _furthest(
+            result[few] = furthest(
                 start,
                 torch.zeros_like(start),
-                lambda to: kish_share(self._log_weights(gaps, floor, to, log_now)) >= MIN_SHARE,
+                lambda to: kish_share(_ratio(raised(to), log_now)) >= MIN_SHARE,
             )
         return result
 
@@ -297,34 +315,22 @@ class Belief(BeliefBase):
         """New samples (S M D) and the inflation (S) of the variance of their mean."""
         start, factor = resample(samples, log_weights, generator)
         excess = inflation * factor - 1
-        n_moves = self._moves_for(samples.shape[2])
-        moved, explained = round_of_moves(start, start, n_moves, target, generator)
-        inflation = 1 + explained * excess
+        moved = self._move(start, target, generator)
+        inflation = 1 + explained_share(start, moved) * excess
         for _ in range(MAX_ROUNDS - 1):
             who = (inflation > 1 / FORGOTTEN).nonzero().squeeze(-1)
             if who.numel() == 0:
                 break
-            again = start[who], moved[who], n_moves, target.of(who)
-            moved[who], explained = round_of_moves(*again, generator)
-            inflation[who] = 1 + explained * excess[who]
+            moved[who] = self._move(moved[who], target.of(who), generator)
+            inflation[who] = 1 + explained_share(start[who], moved[who]) * excess[who]
         return moved, inflation.clamp(1, samples.shape[1])
 
+    def _move(self, samples: Tensor, target: Target, generator: Generator) -> Tensor:
+        """Samples (S M D) after Markov moves that leave the target invariant."""
+        return round_of_moves(samples, self._moves_for(samples.shape[2]), target, generator)
 
-def _furthest(start: Tensor, end: Tensor, fits: Callable[[Tensor], Tensor]) -> Tensor:
-    """(S), the end where it fits, else as near to it as fits, from a start (S) that does.
 
-    ``fits`` takes places (P S) and says for each whether it fits. Thirty times an interval is
-    halved; for a few sessions it is faster to cut it into 32 parts, six times.
-    """
-    reached = fits(end[None])[0]
-    if reached.all():
-        return end
-    parts, times = (32, 6) if len(start) <= 32 else (2, 30)
-    share = torch.linspace(0, 1, parts + 1, device=start.device)[:, None]
-    near, beyond = start, end
-    for _ in range(times):
-        places = torch.lerp(near, beyond, share)
-        # The first place fits, and the last does not.
-        n_fit = fits(places[1:-1]).cumprod(0).sum(0, keepdim=True)
-        near, beyond = places.gather(0, n_fit)[0], places.gather(0, n_fit + 1)[0]
-    return torch.where(reached, end, near)
+def _ratio(log_next: Tensor, log_now: Tensor) -> Tensor:
+    """Log-weights (… S M) of samples with log-likelihoods (S M) that become others (… S M)."""
+    # By rounding a sample may lie just outside of where it was moved to, and is dropped.
+    return log_next - log_now.clamp(min=torch.finfo(log_now.dtype).min)

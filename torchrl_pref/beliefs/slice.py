@@ -21,7 +21,7 @@ import torch
 from torch import Generator, Tensor
 from torch.nn import functional as F
 
-from torchrl_pref.beliefs.resampling import FRAMES, explained_share, group_of, poles_of
+from torchrl_pref.beliefs.resampling import FRAMES, group_of, poles_of
 from torchrl_pref.beliefs.slice_cpu import move_sessions
 from torchrl_pref.compiled import over_sessions
 from torchrl_pref.questions.base import Evidence
@@ -48,20 +48,28 @@ class Target(NamedTuple):
     """(S), to which the likelihood is raised."""
     response_model: ResponseModel
     """The likelihood."""
+    scales: Tensor | None = None
+    """(S 2 M), by what each sample multiplies the returns of its direction, and the answers'
+    floors, which are for lapses; None: 1."""
+
+    def floor(self) -> Tensor:
+        """(S M H) or (S 1 H), of the answers."""
+        floor = self.answers.floor.unsqueeze(1)
+        return floor if self.scales is None else floor * self.scales[:, 1].unsqueeze(-1)
 
     def of(self, sessions: Tensor) -> Target:
         """The same for some of the sessions."""
+        scales = None if self.scales is None else self.scales[sessions]
         some = self.answers[sessions], self.slack[sessions], self.power[sessions]
-        return Target(*some, self.response_model)
+        return Target(*some, self.response_model, scales)
 
 
 def round_of_moves(
-    start: Tensor,
     samples: Tensor,
     n_moves: int,
     target: Target,
     generator: Generator,
-) -> tuple[Tensor, Tensor]:
+) -> Tensor:
     """Move every sample V times, each time along the great circle through it and a pole.
 
     The posterior is left invariant if a pole does not depend on the samples that move towards it:
@@ -69,14 +77,13 @@ def round_of_moves(
     has density |sin ∠(ω, pole)|^(D-2): the meridians of a sphere crowd at its poles.
 
     Args:
-        start: (S M D), where the samples were before any moves.
-        samples: (S M D), where they are.
+        samples: (S M D).
         n_moves: V.
         target: what the moves leave invariant.
         generator: the source of randomness, on the device of the samples.
 
     Returns:
-        Samples (S M D), and how much of their variance ``start`` explains (S).
+        (S M D), unit vectors.
     """
     n_sessions, n_samples, n_features = samples.shape
     device = samples.device
@@ -87,12 +94,11 @@ def round_of_moves(
     poles = poles_of(samples, normal)
     constants = compiled_constants(target.response_model)
     if samples.is_cpu and constants is not None:
-        answers, slack, power, _ = target
-        evidence = answers.rows, answers.offsets, answers.floor
-        moved = compiled_moves(samples, poles, uniform, *evidence, slack, power, ARC, *constants)
-    else:
-        moved = tensor_moves(samples, poles, uniform, target)
-    return moved, explained_share(start, moved)
+        answers, slack, power, _, scales = target
+        scales = samples.new_ones(n_sessions, 2, n_samples) if scales is None else scales
+        evidence = answers.rows, answers.offsets, answers.floor, scales
+        return compiled_moves(samples, poles, uniform, *evidence, slack, power, ARC, *constants)
+    return tensor_moves(samples, poles, uniform, target)
 
 
 def tensor_moves(samples: Tensor, poles: Tensor, uniform: Tensor, target: Target) -> Tensor:
@@ -127,7 +133,9 @@ def _tensor_move(samples: Tensor, poles: Tensor, uniform: Tensor, target: Target
     sine = (rows @ tangents.mT).view(size).permute(1, 2, 3, 0, 4).contiguous()
     raised = answers.offsets.permute(1, 2, 3, 0).unsqueeze(-1).expand_as(cosine).clone()
     raised[-1] += target.slack.unsqueeze(-1)
-    floor = answers.floor.unsqueeze(1)
+    if target.scales is not None:
+        cosine, sine = cosine * target.scales[:, 0], sine * target.scales[:, 0]
+    floor = target.floor()
 
     def log_density(angle: Tensor) -> Tensor:
         """(S M), of the points at an angle (S M) on their circles."""
@@ -167,6 +175,7 @@ def compiled_moves(
     rows: Tensor,
     offsets: Tensor,
     floor: Tensor,
+    scales: Tensor,
     slack: Tensor,
     power: Tensor,
     arc: float,
@@ -180,7 +189,7 @@ def compiled_moves(
         poles: (V S P D).
         uniform: (V S M U), in [0, 1): two, and one for each shrink.
         rows, offsets, floor: (S H F J D), (S H F J) and (S H), see ``questions.base.Evidence``.
-        slack, power: (S), see :class:`Target`.
+        scales, slack, power: (S 2 M), (S) and (S), see :class:`Target`.
         arc: length of the arc that is searched, in lengths of the pole.
         tau: what the gaps are multiplied by; infinite for answers without error.
         tolerance: of answers without error: gaps this small are ties.
@@ -189,7 +198,7 @@ def compiled_moves(
         (S M D), unit vectors.
     """
     moved = torch.empty_like(samples, memory_format=torch.contiguous_format)
-    given = samples, poles, uniform, rows, offsets, floor, slack, power, moved
+    given = samples, poles, uniform, rows, offsets, floor, scales, slack, power, moved
     arrays = (t.contiguous().numpy() for t in given)
     over_sessions(move_sessions, len(samples), *arrays, arc, tau, tolerance)
     return moved

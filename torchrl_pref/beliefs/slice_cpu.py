@@ -34,6 +34,7 @@ def move_sessions(
     rows: Array,
     offsets: Array,
     floor: Array,
+    scales: Array,
     slack: Array,
     power: Array,
     moved: Array,
@@ -47,7 +48,8 @@ def move_sessions(
         unit = 1.0 if hard else tau
         given = _flatten(rows[s], offsets[s], floor[s], float(slack[s]), unit)
         constants = float(power[s]), arc, hard, tolerance
-        _move_session(samples[s], poles[:, s], uniform[:, s], moved[s], *given, *constants)
+        some = samples[s], scales[s], poles[:, s], uniform[:, s], moved[s]
+        _move_session(*some, *given, *constants)
 
 
 @compiled
@@ -87,6 +89,7 @@ def _flatten(
 @compiled
 def _move_session(
     samples: Array,
+    scales: Array,
     poles: Array,
     uniform: Array,
     moved: Array,
@@ -99,7 +102,8 @@ def _move_session(
     hard: bool,
     tolerance: float,
 ) -> None:
-    """Fill ``moved`` (M D) with where V moves take the samples (M D) of a session."""
+    """Fill ``moved`` (M D) with where V moves take the samples (M D) of a session, whose gaps and
+    floors count by ``scales`` (2 M)."""
     n_samples, n_features = samples.shape
     places = np.empty((n_features, n_samples))
     for m in range(n_samples):
@@ -115,6 +119,7 @@ def _move_session(
             row = rows[g, d]
             for m in range(n_samples):
                 gaps[g, m] += row * places[d, m]
+    scaled = np.any(scales[0] != 1)
     # At an angle on a circle the gaps are circles[0] cos(angle) + circles[1] sin(angle) + raised.
     circles = np.empty((2, len(raised), n_samples))
     for v in range(len(poles)):
@@ -122,8 +127,10 @@ def _move_session(
         ahead = _products(poles[v], rows)
         circles[0] = gaps
         _turn_gaps(gaps, circles[1], ahead, along, height)
-        given = circles, raised, ends, floors, pole, arcs, uniform[v], power, n_features - 2
-        turn = _search(*given, hard, tolerance)
+        if scaled:
+            circles *= scales[0]
+        given = circles, raised, ends, floors, scales[1], pole, arcs, uniform[v], power
+        turn = _search(*given, n_features - 2, hard, tolerance)
         cosine, sine = np.cos(turn), np.sin(turn)
         for m in range(n_samples):
             sine[m] /= height[m]
@@ -207,6 +214,7 @@ def _search(
     raised: Array,
     ends: Array,
     floors: Array,
+    odds: Array,
     pole: Array,
     arcs: Array,
     uniform: Array,
@@ -218,7 +226,8 @@ def _search(
     """Angles (M) in the slices: proposals on the arcs, which shrink to each one that is refused."""
     n = circles.shape[2]
     turn, angle, cosine, sine = np.zeros(n), np.empty(n), np.ones(n), np.zeros(n)
-    level = _surprise(circles, raised, ends, floors, cosine, sine, hard, tolerance)
+    odds = odds.copy()
+    level = _surprise(circles, raised, ends, floors, odds, cosine, sine, hard, tolerance)
     for m in range(n):
         level[m] = power * level[m] - meridians * _log(abs(pole[1, m]))
         level[m] = min(level[m] - _log(1.0 - uniform[m, 1]), 1e300)  # the impossible stays above
@@ -230,7 +239,7 @@ def _search(
             m = left[j]
             angle[j] = arcs[0, m] + uniform[m, i] * (arcs[1, m] - arcs[0, m])
             cosine[j], sine[j] = math.cos(np.float32(angle[j])), math.sin(np.float32(angle[j]))
-        given = circles, raised, ends, floors, cosine[:n], sine[:n]
+        given = circles, raised, ends, floors, odds, cosine[:n], sine[:n]
         surprise = _surprise(*given, hard, tolerance)
         n_tried, n = n, 0
         for j in range(n_tried):
@@ -244,6 +253,8 @@ def _search(
                 n += 1
         if n == 0:
             break
+        for j in range(n):
+            odds[j] = odds[refused[j]]
         for g in range(len(raised)):
             for j in range(n):
                 circles[0, g, j] = circles[0, g, refused[j]]
@@ -278,6 +289,7 @@ def _surprise(
     raised: Array,
     ends: Array,
     floors: Array,
+    odds: Array,
     cosine: Array,
     sine: Array,
     hard: bool,
@@ -311,7 +323,7 @@ def _surprise(
         if floors[e] > 0:  # the floor is added to what this answer alone is likely
             for j in range(n):
                 alone = total[j] - before[j]
-                total[j] = before[j] - math.log(math.exp(-alone) + floors[e])
+                total[j] = before[j] - math.log(math.exp(-alone) + floors[e] * odds[j])
         if floors[e] >= 0:
             for j in range(n):
                 before[j] = total[j]

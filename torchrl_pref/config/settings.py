@@ -125,6 +125,7 @@ ALGORITHMS: dict[str, dict[str, Check]] = {
         "algorithm.minibatches": count(1),
     },
 }
+SAMPLED: dict[str, Check] = {"belief.samples": count(2), "belief.moves": optional(count(1))}
 OTHERS: dict[str, dict[str, dict[str, Check]]] = {
     "task": {
         "gridworld": {
@@ -134,7 +135,11 @@ OTHERS: dict[str, dict[str, dict[str, Check]]] = {
     },
     "question": {"choice": {}},
     "human": {"simulated": {"human.spread": check_spread}},
-    "belief": {"sampled": {"belief.samples": count(2), "belief.moves": optional(count(1))}},
+    "belief": {
+        "sampled": SAMPLED,
+        "rationality": {**SAMPLED, "belief.spread": check_spread},
+        "laplace": {"belief.samples": count(2)},
+    },
 }
 """Of the other groups. What is not in here is checked by what is made of it: ``open_groups``."""
 

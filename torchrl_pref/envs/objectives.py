@@ -22,6 +22,7 @@ from torchrl_pref.acquisition.scoring import predict_answers, score_queries
 from torchrl_pref.envs.transition import SessionState
 from torchrl_pref.errors import check_choice
 from torchrl_pref.questions.response_model import ResponseModel
+from torchrl_pref.tensors import directions
 
 
 def alignment(samples: Tensor, omega: Tensor) -> Tensor:
@@ -33,8 +34,8 @@ def alignment(samples: Tensor, omega: Tensor) -> Tensor:
 
 
 def alignment_of_mean(samples: Tensor, omega: Tensor) -> Tensor:
-    """The cosine (… 1) of the mean of samples (… M D) with weights (… D)."""
-    return F.cosine_similarity(samples.mean(-2), omega, dim=-1).unsqueeze(-1)
+    """The cosine (… 1) of the mean direction of samples (… M D) with weights (… D)."""
+    return F.cosine_similarity(directions(samples).mean(-2), omega, dim=-1).unsqueeze(-1)
 
 
 class Objective(ABC):
@@ -78,7 +79,7 @@ class InformationGain(Objective):
 class Alignment(Objective):
     """The length of the mean belief squared: the alignment that the belief itself expects.
 
-    For unit ω, E‖ω̄‖² over the humans that a belief describes is their mean alignment, so this has
+    E‖ω̄‖² over the humans that a belief describes is their mean alignment, so this has
     its expectation without the noise of the one hidden ω.
     """
 
@@ -105,7 +106,7 @@ class TrueAlignment(Objective):
     ) -> Tensor:
         """See :meth:`Objective.forecast`."""
         samples, omega = session["samples"], human["omega"].unsqueeze(1)
-        cosines = (samples @ omega.mT).unsqueeze(1)
+        cosines = (directions(samples) @ omega.mT).unsqueeze(1)
         probs = predict_answers(samples, queries, response_model).probs
         after = (probs * cosines).sum(-2) / probs.sum(-2).clamp(min=1e-30)
         answers = predict_answers(omega, queries, response_model).probs.squeeze(-2)
@@ -122,7 +123,7 @@ class Entropy(Objective):
 
     def potential(self, session: SessionState, human: Mapping[str, Any]) -> Tensor:
         """See :meth:`Objective.potential`."""
-        samples = session["samples"]
+        samples = directions(session["samples"])
         nearest = (
             torch.cdist(samples, samples, compute_mode="donot_use_mm_for_euclid_dist")
             .topk(4, largest=False)

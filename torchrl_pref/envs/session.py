@@ -64,7 +64,7 @@ from torchrl_pref.humans.demonstrations import Demonstrations
 from torchrl_pref.pool import QueryPool
 from torchrl_pref.questions.base import check_same
 from torchrl_pref.questions.prior_evidence import Given, ratio
-from torchrl_pref.tensors import check_finite, check_range, check_shape
+from torchrl_pref.tensors import check_finite, check_range, check_shape, directions
 
 
 def is_feed(env: EnvBase) -> bool:
@@ -170,7 +170,7 @@ class SessionEnv(EnvBase):
             given = given.clone().to_dict()
             overwrite(hidden, given)
             overwrite(cast(Tree, session), given.get("session", {}))
-            session["mean"] = session["samples"].mean(1)
+            session["mean"] = directions(session["samples"]).mean(1)
         mask = None if tensordict is None else tensordict.get("_reset", None)
         self._remember(hidden, mask)
         shown = self._shown(session, hidden)

@@ -16,7 +16,7 @@ from torchrl.data import Binary, Composite, Unbounded
 
 from torchrl_pref.envs.transition import LEFT_OUT, NOT_OF_THE_POOL, OPEN, History, Tree
 from torchrl_pref.errors import InputError
-from torchrl_pref.tensors import check_finite, check_plain, check_range, check_shape
+from torchrl_pref.tensors import check_finite, check_plain, check_range, check_shape, lengths
 
 Key = str | tuple[str, ...]
 
@@ -70,7 +70,7 @@ def check_state(
             "expected at least one; give humans as env.reset() returns them, or set_state=False"
         )
     _check_ranges(state, fresh, n_queries, n_answers)
-    _check_vectors(state)
+    _check_vectors(state, fresh["session", "samples"])
     _check_history(state)
     if ("session", "given", "rows") in fresh.keys(True):
         _check_given(state)
@@ -126,10 +126,14 @@ def _check_part(name: str, value: Tensor, expected: Tensor) -> Tensor:
     return value
 
 
-def _check_vectors(state: dict[Key, Tensor]) -> None:
-    """Samples lie on the unit sphere, and a human has a direction."""
+def _check_vectors(state: dict[Key, Tensor], fresh: Tensor) -> None:
+    """Samples have a direction, and lie on the unit sphere where the belief's own (B M D) do; a
+    human has a direction."""
     samples, omega = state.get(("session", "samples")), state.get(("human", "omega"))
-    if samples is not None and ((samples.norm(dim=-1) - 1).abs() > 0.01).any():
+    if samples is not None and (samples == 0).all(-1).any():
+        raise InputError("samples of length 0: expected directions; give weights above zero")
+    unit = bool((lengths(fresh) == 1).all())
+    if unit and samples is not None and ((lengths(samples) - 1).abs() > 0.01).any():
         raise InputError(
             "samples that are not of length 1: expected points of the unit sphere, as tau carries "
             "the scale; divide them by their length, as by torch.nn.functional.normalize"

@@ -20,7 +20,7 @@ from torchrl_pref.beliefs.base import BeliefBase
 from torchrl_pref.errors import InputError
 from torchrl_pref.humans.base import REFUSED
 from torchrl_pref.questions.prior_evidence import Given, evidence_of, joined
-from torchrl_pref.tensors import check_range
+from torchrl_pref.tensors import check_range, directions
 
 OPEN, LEFT_OUT = -1, -3
 """Marks in a history in the place of an answer, beside ``REFUSED``: not asked yet; answered, but
@@ -50,7 +50,7 @@ class SessionState(TypedDict):
     samples: Tensor
     """(B M D), the belief."""
     mean: Tensor
-    """(B D), the mean of the samples."""
+    """(B D), the mean direction of the samples."""
     ess: Tensor
     """(B 1), effective sample size of the belief."""
     information: Tensor
@@ -79,7 +79,7 @@ def begin(samples: Tensor, budget: int, n_options: int) -> SessionState:
     open_slots = torch.full((size, budget), OPEN, device=samples.device)
     return {
         "samples": samples,
-        "mean": samples.mean(1),
+        "mean": directions(samples).mean(1),
         "ess": zero + n_samples,
         "information": zero,
         "n_asked": zero.long(),
@@ -109,7 +109,12 @@ def hear(
         samples, ess, used = belief.update(samples, ess, evidence[:, : g + 1], generator)
         offsets[:, g] = offsets[:, g].masked_fill(~used.unsqueeze(-1), torch.inf)
     heard: Given = {"rows": given["rows"], "offsets": offsets}
-    known = {"samples": samples, "mean": samples.mean(1), "ess": ess.unsqueeze(-1), "given": heard}
+    known = {
+        "samples": samples,
+        "mean": directions(samples).mean(1),
+        "ess": ess.unsqueeze(-1),
+        "given": heard,
+    }
     return cast(SessionState, {**session, **known})
 
 
@@ -175,7 +180,7 @@ def _learn(
         evidence = joined(evidence_of(session["given"]), evidence)
     update = belief.update(samples, session["ess"].squeeze(-1), evidence, generator)
     gain = score_queries(samples, query, model, information_gain)
-    session["samples"], session["mean"] = update.samples, update.samples.mean(1)
+    session["samples"], session["mean"] = update.samples, directions(update.samples).mean(1)
     session["ess"] = update.ess.unsqueeze(-1)
     session["information"] = session["information"] + gain
     return torch.where(update.used, answers, LEFT_OUT)

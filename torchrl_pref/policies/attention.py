@@ -24,6 +24,7 @@ from torchrl_pref.policies.base import (
     belief_summary,
     compared,
 )
+from torchrl_pref.tensors import directions
 
 WIDTH, HEADS = 32, 4
 
@@ -41,8 +42,8 @@ def belief_tokens(samples: Tensor, kind: str) -> Tensor:
     mean = samples.mean(1, keepdim=True)
     if kind == "mean":
         return mean
-    variances, directions = torch.linalg.eigh(covariance_of(samples))
-    steps = (directions * variances.clamp(min=0).sqrt().unsqueeze(-2)).mT
+    variances, axes = torch.linalg.eigh(covariance_of(samples))
+    steps = (axes * variances.clamp(min=0).sqrt().unsqueeze(-2)).mT
     return torch.cat([mean, mean + steps, mean - steps], 1)
 
 
@@ -71,7 +72,7 @@ class AttentionScorer(nn.Module):
         """From samples (B M D), candidates (B C K D) and shares (B s) to scores (B C)."""
         candidates, options = queries.shape[1:3]
         shown = self.option(compared(queries).flatten(1, 2))
-        keys, values = self.point(belief_tokens(samples, self.tokens)).chunk(2, -1)
+        keys, values = self.point(belief_tokens(directions(samples), self.tokens)).chunk(2, -1)
         split = [part.unflatten(-1, (HEADS, -1)).transpose(1, 2) for part in (shown, keys, values)]
         seen = F.scaled_dot_product_attention(*split).transpose(1, 2).flatten(2)
         shares = shares.unsqueeze(1).expand(-1, seen.shape[1], -1)

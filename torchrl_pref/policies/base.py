@@ -19,6 +19,7 @@ from torchrl.modules import MLP, MaskedCategorical, ProbabilisticActor, ValueOpe
 
 from torchrl_pref.beliefs.resampling import covariance_of
 from torchrl_pref.envs.session import is_feed
+from torchrl_pref.tensors import directions
 
 
 @dataclass(frozen=True)
@@ -151,7 +152,7 @@ class BeliefFeatures(nn.Module):
 
     def forward(self, samples: Tensor, remaining: Tensor) -> Tensor:
         """From samples (B M D) and shares (B 1 or 2) to features (B G)."""
-        return torch.cat([remaining, self.summary(samples)], -1)
+        return torch.cat([remaining, self.summary(directions(samples))], -1)
 
 
 def belief_summary(samples: Tensor) -> Tensor:

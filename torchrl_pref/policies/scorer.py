@@ -35,6 +35,7 @@ from torchrl_pref.policies.base import (
 )
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.strategies import OfferRank, asks_over_offers
+from torchrl_pref.tensors import directions
 
 N_CANDIDATE = 7
 """F, see :class:`CandidateFeatures`."""
@@ -178,13 +179,14 @@ class OfferFeatures(nn.Module):
 
 
 def _moments(samples: Tensor) -> Tensor:
-    """Mean, and below it covariance (B 1+D D), of samples (B M D)."""
+    """Mean, and below it covariance (B 1+D D), of the directions of samples (B M D)."""
+    samples = directions(samples)
     return torch.cat([samples.mean(1, keepdim=True), covariance_of(samples)], 1)
 
 
 def _unsure(samples: Tensor) -> Tensor:
     """One plus the log of the misalignment (B 1) that a belief (B M D) expects."""
-    misaligned = 1 - samples.mean(1).square().sum(-1, keepdim=True)
+    misaligned = 1 - directions(samples).mean(1).square().sum(-1, keepdim=True)
     # Plus one: a log that is never above 0 could only lower the share, not raise it. The floor
     # bounds what a belief that is all but certain can ask of the patience.
     return misaligned.clamp(min=1e-3).log() + 1

@@ -1,0 +1,127 @@
+"""What it costs not to know how careful a person is: a belief that infers tau, and two told one.
+
+``python benchmarks/rationality.py [--humans 300] [--json FILE]``. Humans' tau is the reference
+times a factor, and they answer 20 greedy questions of each of three beliefs: one that infers tau,
+one that is told the reference, and one that is told the human's own. All face the same humans and
+the same luck. *Coverage* is how often the human's return of a random trajectory lies in the central
+interval that the belief holds for so likely, over the humans of all factors.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+sys.path[0] = str(Path(__file__).resolve().parents[1])  # this folder's select.py hides Python's
+
+from itertools import product
+
+import torch
+from torch import Generator, Tensor
+
+from benchmarks import common
+from torchrl_pref.acquisition import ACQUISITIONS
+from torchrl_pref.beliefs.base import BeliefBase
+from torchrl_pref.beliefs.rationality import RationalityBelief
+from torchrl_pref.beliefs.sampled import Belief
+from torchrl_pref.envs.objectives import alignment_of_mean
+from torchrl_pref.envs.query import QueryEnv
+from torchrl_pref.humans.simulated import SimulatedHuman
+from torchrl_pref.pool import Normalizer, QueryPool
+from torchrl_pref.questions.responses import Boltzmann
+from torchrl_pref.strategies import Greedy
+from torchrl_pref.tensors import directions
+
+FACTORS = (1 / 8, 1 / 4, 1 / 2, 1.0, 2.0, 4.0, 8.0)
+LEVELS = (0.5, 0.8, 0.9, 0.95)
+BUDGET = 20
+TRAJECTORIES = 20
+"""Random ones whose returns are looked at, for each human."""
+
+
+def main() -> None:
+    """Print the cosines, their paired differences, and the coverage."""
+    parser = common.arguments(__doc__)
+    parser.add_argument("--humans", type=int, default=300, help="of each factor (default 300)")
+    parser.add_argument("--queries", type=int, default=500, help="of a pool (default 500)")
+    parser.add_argument("--seed", type=int, default=0, help="of the humans (default 0)")
+    parser.add_argument("--lapse", type=float, default=0.0, help="that beliefs expect (default 0)")
+    options = common.start(parser)
+    pools = {"Gridworld": gridworld(options.queries), "isotropic": isotropic(options.queries)}
+    cosines: list[common.Row] = []
+    covered: list[common.Row] = []
+    for (name, pool), how in product(pools.items(), ("alignment_gain", "information_gain")):
+        inside: dict[str, list[Tensor]] = {}
+        for factor in FACTORS:
+            row: common.Row = {"pool": name, "greedy by": how, "factor": factor}
+            found = {}
+            for kind, belief in beliefs(factor, options.lapse).items():
+                samples, omega = asked(pool, belief, how, factor, options.humans, options.seed)
+                found[kind] = alignment_of_mean(samples, omega).squeeze(-1)
+                row[kind] = float(found[kind][:, -1].mean())
+                inside.setdefault(kind, []).append(coverage(samples[:, -1], omega[:, -1]))
+            for other in ("told wrongly", "told rightly"):
+                gain = (found["inferred"] - found[other])[:, -1]
+                row[f"less {other}"] = float(gain.mean())
+                row["± " + other.split()[1]] = float(gain.std() / len(gain) ** 0.5)
+            cosines.append(row)
+        for kind, each in inside.items():
+            shares = torch.stack(each).mean(0).tolist()
+            levels = {f"{level:.0%}": share for level, share in zip(LEVELS, shares, strict=True)}
+            covered.append({"pool": name, "greedy by": how, "belief": kind, **levels})
+    title = f"Cosine of the mean after {BUDGET} answers, {options.humans} humans a row"
+    common.report(title, cosines, options.json)
+    common.report("Coverage of central intervals", covered, None)
+
+
+def gridworld(n_queries: int) -> QueryPool:
+    """The Gridworld's, normalised."""
+    return common.normalised_pool(n_queries)
+
+
+def isotropic(n_queries: int) -> QueryPool:
+    """Four independent normal features."""
+    features = torch.randn(n_queries, 2, 4, generator=Generator().manual_seed(0))
+    return QueryPool(features).map_features(Normalizer.fit(features))
+
+
+def beliefs(factor: float, lapse: float) -> dict[str, BeliefBase]:
+    """Those that are compared, where humans' tau is the reference times a factor."""
+    reference = Boltzmann(common.TAU, lapse=lapse)
+    return {
+        "inferred": RationalityBelief(reference),
+        "told wrongly": Belief(reference),
+        "told rightly": Belief(Boltzmann(common.TAU * factor, lapse=lapse)),
+    }
+
+
+def asked(
+    pool: QueryPool, belief: BeliefBase, how: str, factor: float, humans: int, seed: int
+) -> tuple[Tensor, Tensor]:
+    """Samples (S H M D) after each answer, and the humans' weights (S H D)."""
+    human = SimulatedHuman(Boltzmann(common.TAU))
+    env = QueryEnv(pool, human, belief, BUDGET, batch_size=(humans,), seed=seed)
+    start = env.reset()
+    start["human", "care"].fill_(factor)
+    start = env.reset(start, set_state=True)
+    strategy = Greedy(belief.response_model, ACQUISITIONS[how])
+    done = env.rollout(BUDGET, strategy, auto_reset=False, tensordict=start)
+    return done["next", "session", "samples"], done["human", "omega"]
+
+
+def coverage(samples: Tensor, omega: Tensor) -> Tensor:
+    """How often central intervals of each level hold the human's return of a random trajectory."""
+    size = (len(omega), TRAJECTORIES, omega.shape[-1])
+    shown = torch.randn(size, generator=Generator().manual_seed(1))
+    returns = directions(samples) @ shown.mT
+    true = (shown @ omega.unsqueeze(-1)).squeeze(-1)
+    inside = []
+    for level in LEVELS:
+        ends = returns.new_tensor([0.5 - level / 2, 0.5 + level / 2])
+        low, high = torch.quantile(returns, ends, dim=1)
+        inside.append(((low < true) & (true < high)).double().mean())
+    return torch.stack(inside)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,110 @@
+"""The Gaussian belief: its mode and curvature by autograd, and beside the samples."""
+
+import math
+
+import pytest
+import torch
+from torch import Generator, Tensor
+
+from torchrl_pref.beliefs.base import BeliefBase
+from torchrl_pref.beliefs.laplace import LaplaceBelief, find_mode
+from torchrl_pref.beliefs.sampled import Belief, uniform_sphere
+from torchrl_pref.questions.responses import Boltzmann
+from torchrl_pref.questions.weak import Weak
+
+D = 6
+
+
+@pytest.mark.parametrize(
+    ("model", "n_options"),
+    [(Boltzmann(4.5), 2), (Boltzmann(4.5), 4), (Boltzmann(2.0, Weak(0.3), lapse=0.1), 2)],
+    ids=str,
+)
+def test_newton_finds_the_mode(model: Boltzmann, n_options: int, generator: Generator) -> None:
+    options = torch.randn(3, 8, n_options, D, generator=generator)
+    answers = torch.randint(0, 2, (3, 8), generator=generator)
+    answers[:, 2] = -1
+    evidence = model.evidence(options, answers).double()
+    found = find_mode(evidence.rows.flatten(1, -2), evidence, model)
+    for s in range(3):
+
+        def log_posterior(omega: Tensor, s: int = s) -> Tensor:
+            gaps = evidence.rows[s] @ omega + evidence.offsets[s]
+            likelihood = model.answer_log_likelihood(gaps, evidence.floor[s]).sum()
+            return likelihood - D / 2 * omega.square().sum()
+
+        omega = found.mode[s].clone().requires_grad_()
+        (slope,) = torch.autograd.grad(log_posterior(omega), omega)
+        assert slope.abs().max() < 1e-3
+        if not model.lapse:
+            hessian = torch.autograd.functional.hessian(log_posterior, omega.detach())
+            seen = found.roots[s].T @ evidence.rows[s].flatten(0, -2)
+            curvature = D * torch.eye(D).double() + seen.T @ seen
+            assert torch.allclose(curvature, -hessian, atol=1e-8)
+
+
+def test_samples_have_the_gaussian_s_moments(generator: Generator) -> None:
+    """Against draws by a D times D Cholesky factor, put out and stretched in the same way."""
+    model, sessions = Boltzmann(4.5), 500
+    options = torch.randn(1, 8, 2, D, generator=generator)
+    answers = (options @ uniform_sphere((D,), generator)).argmax(-1)
+    evidence = model.evidence(options, answers)
+    rows = evidence.rows.flatten(1, -2).double()
+    found = find_mode(rows, evidence, model)
+    seen = found.roots[0].T @ rows[0]
+    covariance = torch.linalg.inv(D * torch.eye(D).double() + seen.T @ seen)
+    length = math.sqrt(1 - float(covariance.trace()))
+    centre = found.mode[0] / found.mode[0].norm() * length
+    normal = torch.randn(50_000, D, generator=generator).double()
+    exact = centre + normal @ torch.linalg.cholesky(covariance).T
+    exact /= exact.norm(dim=-1, keepdim=True)
+    belief = LaplaceBelief(model)
+    many = evidence.expand(sessions, 8)
+    samples = belief.update(
+        belief.prior(sessions, D, generator), torch.full((sessions,), 100.0), many, generator
+    ).samples.double()
+    assert torch.allclose(samples.mean((0, 1)), exact.mean(0), atol=0.01)
+    centred, expected = samples - exact.mean(0), exact - exact.mean(0)
+    second = torch.einsum("smd,sme->de", centred, centred) / sessions / 100
+    assert torch.allclose(second, expected.T @ expected / len(exact), atol=0.005)
+
+
+def after(
+    belief: BeliefBase, options: Tensor, answers: Tensor, at_once: bool
+) -> tuple[Tensor, Tensor]:
+    """Samples after answers (S H), and their mean."""
+    generator = Generator().manual_seed(1)
+    samples = belief.prior(len(answers), options.shape[-1], generator)
+    ess = torch.full((len(answers),), 100.0)
+    n_answers = answers.shape[1]
+    for h in range(n_answers if at_once else 1, n_answers + 1):
+        evidence = belief.response_model.evidence(options[:, :h], answers[:, :h])
+        samples, ess, _ = belief.update(samples, ess, evidence, generator)
+    return samples, samples.mean(1)
+
+
+@pytest.mark.parametrize("n_features", [4, 8])
+def test_it_is_near_to_the_samples(n_features: int, generator: Generator) -> None:
+    model, sessions = Boltzmann(2.0), 200
+    omega = uniform_sphere((sessions, n_features), generator)
+    options = torch.randn(sessions, 12, 2, n_features, generator=generator)
+    chances = model((options @ omega[:, None, :, None]).squeeze(-1)).exp().flatten(0, 1)
+    answers = chances.multinomial(1, generator=generator).view(sessions, 12)
+    _, right = after(Belief(model), options, answers, at_once=False)
+    samples, mean = after(LaplaceBelief(model), options, answers, at_once=True)
+    cosines = [torch.cosine_similarity(each, omega).mean() for each in (mean, right)]
+    assert cosines[0] > cosines[1] - 0.015
+    shown = torch.randn(sessions, n_features, 1, generator=generator)
+    low, high = torch.quantile((samples @ shown).squeeze(-1), torch.tensor([0.1, 0.9]), dim=1)
+    true = (omega * shown.squeeze(-1)).sum(-1)
+    assert float(((low < true) & (true < high)).float().mean()) == pytest.approx(0.8, abs=0.08)
+
+
+def test_hundreds_of_features(generator: Generator) -> None:
+    belief, n_features = LaplaceBelief(Boltzmann(4.5)), 512
+    omega = uniform_sphere((5, n_features), generator)
+    options = torch.randn(5, 60, 2, n_features, generator=generator)
+    answers = (options @ omega[:, None, :, None]).squeeze(-1).argmax(-1)
+    samples, mean = after(belief, options, answers, at_once=True)
+    assert torch.allclose(samples.norm(dim=-1), torch.ones(1), atol=1e-5)
+    assert (torch.cosine_similarity(mean, omega) > 0.1).all()

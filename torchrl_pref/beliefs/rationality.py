@@ -1,0 +1,158 @@
+"""A belief that infers how careful a person is, beside what they want.
+
+Shapes: S sessions, M samples, H answers, F factors of an answer, J rows of a factor, D features, U
+uniforms of a move.
+
+A person's tau is never known. Here it is s times the response model's, with ln s normal and
+independent of ω, and a sample is the vector s ω. Its return gaps are then s times
+those of ω, so that the response model needs no change, and a threshold in logits stays what it is.
+The samples move as those of ``sampled.Belief`` do, each on the sphere of its own length, and then
+along their rays: by slice sampling (Neal, 2003) of ln s, given ω and all answers. Where the
+response model has a lapse rate, that is inferred too: see ``lapses.py``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Generator, Tensor
+
+from torchrl_pref.beliefs.lapses import LapseRates
+from torchrl_pref.beliefs.sampled import Belief
+from torchrl_pref.beliefs.slice import MAX_SHRINKS, Target
+from torchrl_pref.errors import InputError, check_positive
+from torchrl_pref.questions.base import Evidence
+from torchrl_pref.questions.response_model import ResponseModel
+from torchrl_pref.questions.responses import Optimal
+from torchrl_pref.tensors import directions, lengths
+
+FARTHEST = 4.0
+"""Standard deviations of ln s that are thought possible."""
+
+
+class RationalityBelief(Belief):
+    """Posterior samples of tau and ω together.
+
+    Args:
+        response_model: how the belief thinks that people answer; its tau is the middle of what is
+            believed of theirs, and its lapse rate the mean; 0 is believed for certain.
+        spread: the factor by which people's tau differs from the model's, either way: two in three
+            are within it, and 19 in 20 within its square.
+        samples: M, see :class:`Belief`.
+        moves: of ω after each resampling, see :class:`Belief`; one of tau follows.
+
+    Raises:
+        InputError: there is no response model, or one of a human who never errs; or a number is
+            out of its range, as is a lapse rate of a quarter or more.
+    """
+
+    def __init__(
+        self,
+        response_model: ResponseModel,
+        spread: float = 3.0,
+        samples: int = 100,
+        moves: int | None = None,
+    ) -> None:
+        super().__init__(response_model, samples, moves)
+        if isinstance(response_model, Optimal):
+            raise InputError(
+                "belief=rationality with a human who never errs: there is no tau to infer; "
+                "expected tau=noisy or a number, or belief=sampled"
+            )
+        self.spread = check_positive("belief.spread", spread)
+        if not 1 <= spread <= 1e6:
+            raise InputError(
+                f"belief.spread={spread}: expected a factor of at least 1, and at most 1e6; 1 is a "
+                "tau that is known"
+            )
+        _ = self._rates  # or its lapse rate is refused here
+
+    def prior(self, n_sessions: int, n_features: int, generator: Generator) -> Tensor:
+        """Samples of the prior, (S M D)."""
+        omega = super().prior(n_sessions, n_features, generator)
+        normal = torch.randn(
+            (n_sessions, self.n_samples, 1), generator=generator, device=generator.device
+        )
+        return omega * self.spread ** normal.clamp(-FARTHEST, FARTHEST)
+
+    @property
+    def _rates(self) -> LapseRates | None:
+        """What is believed of the lapse rate; None: that there are no lapses."""
+        return LapseRates(self.response_model) if self.response_model.lapse else None
+
+    def _foreseen(self, samples: Tensor, answers: Evidence) -> Tensor:
+        """See :meth:`Belief._foreseen`."""
+        if self._rates is None:
+            return super()._foreseen(samples, answers)
+        return self._rates.raised(samples, answers)(samples.new_zeros(len(samples)))
+
+    def _raised(self, samples: Tensor, answers: Evidence) -> Callable[[Tensor], Tensor]:
+        """See :meth:`Belief._raised`."""
+        if self._rates is None:
+            return super()._raised(samples, answers)
+        return self._rates.raised(samples, answers)
+
+    def _tempered(self, samples: Tensor, answers: Evidence) -> Callable[[Tensor, Tensor], Tensor]:
+        """See :meth:`Belief._tempered`."""
+        if self._rates is None:
+            return super()._tempered(samples, answers)
+        return self._rates.tempered(samples, answers)
+
+    def _move(self, samples: Tensor, target: Target, generator: Generator) -> Tensor:
+        """See :meth:`Belief._move`; and along the rays, all with a lapse rate for each sample."""
+        length = lengths(samples).squeeze(-1)
+        odds = torch.ones_like(length)
+        if self._rates is not None:
+            odds = self._rates.draw(samples, target, generator)
+        target = target._replace(scales=torch.stack([length, odds], 1))
+        omega = super()._move(directions(samples), target, generator)
+        size = (*length.shape, 1 + MAX_SHRINKS)
+        uniform = torch.rand(size, generator=generator, device=length.device)
+        return omega * move_lengths(omega, uniform, target, math.log(self.spread))
+
+
+def move_lengths(omega: Tensor, uniform: Tensor, target: Target, deviation: float) -> Tensor:
+    """One move of each sample along its ray, which leaves the target invariant.
+
+    Args:
+        omega: (S M D), the samples' directions.
+        uniform: (S M U), in [0, 1): one, and one for each shrink.
+        target: the likelihood, with the lengths that the samples have.
+        deviation: of log-lengths before any answer.
+
+    Returns:
+        (S M 1), the lengths that they get.
+    """
+    answers, scales = target.answers, target.scales
+    assert scales is not None
+    size = (*answers.rows.shape[:-1], omega.shape[1])
+    # Samples are innermost in memory: every operation below then runs along them.
+    gaps = (answers.rows.flatten(1, -2) @ omega.mT).view(size).permute(1, 2, 3, 0, 4).contiguous()
+    raised = answers.offsets.permute(1, 2, 3, 0).unsqueeze(-1).expand_as(gaps).clone()
+    raised[-1] += target.slack.unsqueeze(-1)
+    floor = target.floor()
+
+    def log_density(log_length: Tensor) -> Tensor:
+        """(S M), at log-lengths (S M)."""
+        given = torch.addcmul(raised, gaps, log_length.exp()).permute(3, 4, 0, 1, 2)
+        likelihood = target.response_model.joint_log_likelihood(given, floor)
+        prior = -(log_length / deviation).square() / 2
+        return prior + target.power.unsqueeze(-1) * likelihood
+
+    deviation, end = max(deviation, 1e-6), FARTHEST * deviation
+    level, *fractions = uniform.unbind(-1)
+    log_length = scales[:, 0].log().clamp(-end, end)
+    threshold = log_density(log_length) + torch.log1p(-level)
+    threshold = threshold.clamp(min=torch.finfo(threshold.dtype).min)
+    low, high = torch.full_like(log_length, -end), torch.full_like(log_length, end)
+    place, found = log_length, torch.zeros_like(log_length, dtype=torch.bool)
+    for fraction in fractions:
+        proposal = torch.lerp(low, high, fraction)
+        accepted = log_density(proposal) >= threshold
+        place = torch.where(accepted & ~found, proposal, place)
+        found |= accepted
+        ahead = proposal > log_length
+        low, high = torch.where(ahead, low, proposal), torch.where(ahead, proposal, high)
+    return place.exp().unsqueeze(-1)

@@ -121,11 +121,12 @@ NO_SETTINGS = ("actor", "csv", "png", "py", "strategy")
 @functools.cache
 def known_keys() -> set[str]:
     """Every key that either script has, whatever is chosen."""
-    groups = ("setup=query", "setup=feed", "question=weak", "policy=attention", "policy=scorer")
+    groups = ("setup=query", "setup=feed", "question=weak", "belief=rationality")
+    groups += ("policy=attention", "policy=scorer")
     tasks = ("task=lds", "task=gymnasium", "task=torchrl", "task=files", "task=minari")
     humans = [f"human={name}" for name in HUMANS]
     typed_here = [("train", one) for one in (*groups, *tasks, *humans, "algorithm=ppo")]
-    typed_here += [("evaluate", one) for one in groups[:3]]
+    typed_here += [("evaluate", one) for one in groups[:4]]
     keys = set(chain(*(keys_of(OmegaConf.create(composed(*one))) for one in typed_here)))
     return keys | {key.partition(".")[0] for key in keys} | {"experiment"}
 

@@ -15,7 +15,7 @@ from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.objectives import make_objective
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.policies.attention import TOKENS, attention_policy, belief_tokens
-from torchrl_pref.policies.base import Policy
+from torchrl_pref.policies.base import Policy, belief_summary
 from torchrl_pref.policies.paper import paper_policy
 from torchrl_pref.policies.scorer import (
     FEED_SCALE,
@@ -216,10 +216,13 @@ def test_belief_is_summed_up_by_its_length_and_its_widths(
     session = session_of(env)
     session["samples"] = samples.repeat(4, 1, 1)
     session["remaining"] = torch.full((4, 1), 0.3)
-    found = scorer_policy(env).strategy(session)["belief_features"][2]
     widths = torch.stack([variances.max(), variances.mean(), variances.min()]).log() / 4
-    expected = torch.cat([torch.tensor([0.3]), mean.norm().unsqueeze(0), widths])
-    assert torch.allclose(found, expected, atol=1e-4)
+    expected = torch.cat([mean.norm().unsqueeze(0), widths])
+    assert torch.allclose(belief_summary(samples.unsqueeze(0))[0], expected, atol=1e-4)
+    # A policy sees of samples where they point, and not how long they are.
+    found = scorer_policy(env).strategy(session)["belief_features"][2]
+    expected = belief_summary((samples / samples.norm(dim=-1, keepdim=True)).unsqueeze(0))[0]
+    assert torch.allclose(found, torch.cat([torch.tensor([0.3]), expected]), atol=1e-4)
 
 
 @pytest.mark.parametrize("kind", ENVS)

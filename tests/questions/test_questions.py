@@ -100,9 +100,9 @@ def quadrature() -> Tensor:
 def test_the_posterior_is_that_of_the_probabilities(
     model: ResponseModel, n_options: int, in_tensors: bool, generator: Generator
 ) -> None:
-    """Of five answers once each and one more surprise, by quadrature over probabilities alone."""
+    """Of three answers once each and the first again, by quadrature over probabilities alone."""
     n_answers = model.n_answers(n_options)
-    answers = torch.tensor([*range(min(n_answers, 5)), 0])
+    answers = torch.tensor([*range(min(n_answers, 3)), 0])
     queries = torch.randn(len(answers), n_options, 3, generator=generator)
     if isinstance(model, Boltzmann) and in_tensors:
         model = InTensors(model)
@@ -155,6 +155,8 @@ def test_information_is_what_the_probabilities_say(
     of_mean = probs.mean(2)
     expected = (probs * np.log2(probs)).sum(-1).mean(2) - (of_mean * np.log2(of_mean)).sum(-1)
     assert np.allclose(found.numpy(), expected, atol=1e-5)
+    if n_options == 1:  # which tells something of its return itself
+        return
     alike = queries[:, :, :1].expand_as(queries)
     assert score_queries(samples, alike, model, information_gain).abs().max() < 1e-5
 

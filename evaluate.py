@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import hydra
 from omegaconf import DictConfig
@@ -49,6 +50,19 @@ PROTOCOL_KEYS = (
     "pool.test",
 )
 """What may be typed beside ``protocol``; the rest is the protocol's own."""
+
+OF_EVALUATION = (
+    "setup",
+    "skip",
+    "device",
+    "task",
+    "pool",
+    "question",
+    "human",
+    "belief",
+    "demonstrations",
+)
+"""Settings that a policy of the package takes from the evaluation, and not from its training."""
 
 
 @hydra.main(config_path="conf", config_name="evaluate", version_base="1.3")
@@ -166,8 +180,8 @@ def pretrained_for(settings: Settings, tau: Any) -> dict[str, Checkpoint]:
     from torchrl_pref.pretrained import pretrained_checkpoint
 
     checkpoint = pretrained_checkpoint(settings["setup"]["name"], tau)
-    for section in ("setup", "belief", "skip", "human", "demonstrations", "question", "device"):
-        checkpoint.settings[section] = settings[section]
+    taken = {key: value for key, value in settings.items() if key in OF_EVALUATION}
+    checkpoint = replace(checkpoint, settings=cast(Settings, {**checkpoint.settings, **taken}))
     return {f"{policy_key(checkpoint.settings)}:pretrained": checkpoint}
 
 

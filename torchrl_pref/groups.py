@@ -48,6 +48,11 @@ def allow(reference: str) -> None:
     _typed.add(reference)
 
 
+def allowed() -> frozenset[str]:
+    """What the user typed, for other processes of the same command to allow."""
+    return frozenset(_typed)
+
+
 def make(group: str, section: Mapping[str, Any], *given: Any, without: tuple[str, ...] = ()) -> Any:
     """The thing that a section chooses, made with its settings.
 

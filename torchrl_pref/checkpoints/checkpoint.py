@@ -20,10 +20,10 @@ from torchrl_pref.storage.files import load_safely
 
 KIND = "torchrl_pref checkpoint"
 
-FORMAT = 5
+FORMAT = 6
 """Raised whenever a key of the settings or of the checkpoint comes, goes or changes its meaning."""
 
-READABLE = (4, FORMAT)
+READABLE = (4, 5, FORMAT)
 """Formats that can be read, the older ones by :mod:`torchrl_pref.checkpoints.migrations`."""
 
 
@@ -91,7 +91,7 @@ class Checkpoint:
         if version not in READABLE or set(content) != set(cls.__dataclass_fields__):
             raise InputError(
                 f"{path}: written by another version of this package (format {version}, expected "
-                f"{' or '.join(map(str, READABLE))}); train again, or use the version that wrote it"
+                f"{', '.join(map(str, READABLE))}); train again, or use the version that wrote it"
             )
         if version != FORMAT:
             migrate(content["settings"])

@@ -41,7 +41,7 @@ def migrate(settings: Any) -> None:
         settings["task"] = {"name": "gridworld", **(grid if isinstance(grid, dict) else {})}
     spread = settings.pop("tau_spread", 1)
     settings.setdefault("human", {"name": "simulated", "spread": spread, "lapse": 0.0})
-    # Up to then the human's tau was the belief's, and nobody showed anything first.
+    # Up to format 5 the human's tau was the belief's, and nobody showed anything first.
     if isinstance(settings["human"], dict):
         settings["human"].setdefault("tau", None)
     settings.setdefault("demonstrations", {"count": 0, "alternatives": 10, "tau": None})

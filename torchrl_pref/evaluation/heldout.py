@@ -30,7 +30,7 @@ from torchrl_pref.evaluation.heldout_pool import (
     try_job,
 )
 from torchrl_pref.evaluation.records import Records
-from torchrl_pref.groups import OWN, TABLES
+from torchrl_pref.groups import OWN, TABLES, allow, allowed, make
 
 POOLS, BALANCED_POOLS = 10, 3
 
@@ -64,7 +64,7 @@ def run_protocol(
     # One file descriptor for each tensor that is passed would be too many for some systems.
     torch.multiprocessing.set_sharing_strategy("file_system")
     context = get_context("spawn")
-    with ProcessPoolExecutor(workers, context, _start_worker) as executor:
+    with ProcessPoolExecutor(workers, context, _start_worker, (allowed(),)) as executor:
         feeds = {job.cell: job for job in jobs if job.cell.setup == "feed" and job.pool == 0}
         fits = [replace(job, learned={}, own=(), thresholds=THRESHOLDS) for job in feeds.values()]
         alignments = executor.map(fit_threshold, fits)
@@ -85,6 +85,7 @@ def _jobs(
     for cell, checkpoints in learned.items():
         for checkpoint in checkpoints:
             _check_fits(settings, cell, checkpoint, checkpoints[0])
+            _check_unseen(settings, checkpoint)
         kinds = kinds_of(checkpoints)
         settings = {**settings, "skip": checkpoints[0].settings["skip"]}
         cells = [(cell._replace(features=features_of(settings)), POOLS)]
@@ -102,12 +103,15 @@ def features_of(settings: Settings) -> str:
     """What the features of the cells are called."""
     if settings["pool"]["test"] is not None:
         return "own"
-    task: str = settings["task"]["name"]
-    return "corners" if task == "gridworld" else task
+    task = settings["task"]
+    name: str = task["make"] if task["name"] == OWN else task["name"]
+    return "corners" if name == "gridworld" else name
 
 
-def _start_worker() -> None:
-    """One thread for each worker, and tensors passed as files."""
+def _start_worker(typed: frozenset[str]) -> None:
+    """One thread for each worker, tensors passed as files, and code of the user's as typed."""
+    for reference in typed:
+        allow(reference)
     torch.set_num_threads(1)
     share_out(1)
     torch.multiprocessing.set_sharing_strategy("file_system")
@@ -162,6 +166,19 @@ def _flat(settings: Mapping[str, Any]) -> dict[str, Any]:
         inner = value.items() if isinstance(value, dict) else ()
         flat |= {f"{key}.{name}": each for name, each in inner} if inner else {key: value}
     return flat
+
+
+def _check_unseen(settings: Settings, checkpoint: Checkpoint) -> None:
+    """Refuse to judge a policy on recorded trajectories that it was trained on."""
+    task, trained = make("task", settings["task"]), checkpoint.settings
+    recorded = task.split(0)[0] is not task
+    mine, theirs = settings["pool"]["seed"], trained["pool"]["seed"]
+    if recorded and trained["task"] == settings["task"] and mine != theirs:
+        raise InputError(
+            f"pool.seed={mine}: the policy was trained with pool.seed={theirs}, and recorded "
+            "trajectories are split by it: it would be tested on some that it was trained on; set "
+            f"pool.seed={theirs}"
+        )
 
 
 def _check_fits(settings: Settings, cell: Cell, checkpoint: Checkpoint, first: Checkpoint) -> None:

@@ -19,6 +19,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, ListConfig, OmegaConf
+from scripts import run_script
 
 from torchrl_pref.checkpoints.checkpoint import Checkpoint
 from torchrl_pref.pool import QueryPool
@@ -45,10 +46,9 @@ def start(script: str, *arguments: str, cwd: Path = ROOT) -> subprocess.Popen[st
 
 
 def run(script: str, *arguments: str, cwd: Path = ROOT) -> str:
-    process = start(script, *arguments, cwd=cwd)
-    output, errors = process.communicate(timeout=120)
-    assert process.returncode == 0, errors
-    return output
+    done = run_script(script, *arguments, folder=cwd)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 def test_train_evaluate_and_resume(tmp_path: Path) -> None:

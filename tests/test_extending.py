@@ -1,11 +1,10 @@
 """Each file of examples/extending is short, and the main job runs with it from outside."""
 
-import os
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from scripts import run_script
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "examples" / "extending"
@@ -26,9 +25,7 @@ JOBS = {
 
 def run(script: str, *arguments: str, folder: Path = FOLDER) -> subprocess.CompletedProcess[str]:
     """A script as a user runs it from that folder."""
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, str(ROOT / script), *arguments]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, env=environment)
+    return run_script(script, *arguments, folder=folder)
 
 
 @pytest.mark.parametrize("path", sorted(FOLDER.glob("*.py")), ids=lambda path: path.stem)

@@ -28,6 +28,7 @@ import shlex
 import shutil
 import subprocess
 from collections.abc import Callable, Iterator
+from itertools import chain
 from typing import Any, NamedTuple
 
 from tabulate import tabulate
@@ -206,6 +207,51 @@ def objectives(folder: Path) -> dict[str, str]:
     return {"objectives": table(rows)}
 
 
+def tasks(folder: Path) -> dict[str, str]:
+    """Strategies on the literature's tasks, beside a policy that was trained there and ours."""
+    tables = {}
+    for task in OTHER_TASKS:
+        records = read_records(folder / f"{task}-heldout" / CSV)
+        for cell in records.tasks:
+            own, rows = records.of_task(cell), []
+            for key in own.strategies:
+                values, gap = alignment(own, key), difference(own, key, "greedy_information")
+                name = name_of(key)
+                if is_judged(key):
+                    ours = "task.name=gridworld" in key
+                    name = (
+                        "RL of the package, made for the Gridworld" if ours else "RL trained on it"
+                    )
+                elif values.shape[2] < alignment(own, own.strategies[0]).shape[2]:
+                    continue  # many samples: on a few humans
+                row = {"strategy": name}
+                row |= {f"after {j}": f"{values[..., j].mean():.3f}" for j in milestones(20)}
+                row["mean of 1 to 20"] = f"{values[..., 1:].mean():.3f}"
+                information = key == "greedy_information"
+                row["minus greedy information gain, mean"] = (
+                    "" if information else interval(gap[..., 1:].mean(-1))
+                )
+                rows.append(row)
+            tables[cell.replace("/", "-")] = table(rows)
+    return tables
+
+
+def on_task(task: str) -> Iterator[str]:
+    """Two trainings on a task, and the held-out protocol there."""
+    for tau in ("noisy", "optimal"):
+        run = f"{{folder}}/{task}-{tau}"
+        line = f"python train.py task={task} setup=query tau={tau} hydra.run.dir={run}"
+        yield f"{line} -> {task}-{tau}/tables.txt"
+    trained = [f"{{folder}}/{task}-{tau}" for tau in ("noisy", "optimal")]
+    ours = [f"torchrl_pref/policies/weights/query-{tau}-0.pt" for tau in ("noisy", "optimal")]
+    line = (
+        f"python evaluate.py protocol=heldout task={task} checkpoint=[{','.join(trained + ours)}]"
+    )
+    yield f"{line} hydra.run.dir={{folder}}/{task}-heldout -> {task}-heldout/{CSV}"
+
+
+OTHER_TASKS = ("driver", "lds")
+
 TRAIN, EVALUATE = "python train.py setup=query tau=noisy", "evaluation.humans=300"
 
 
@@ -269,6 +315,8 @@ PARTS: dict[str, Part] = {
         80,
         objectives,
     ),
+    "tasks": Part("docs/results.md", tuple(chain(*(map(on_task, OTHER_TASKS)))), 20, tasks),
+    "answers": measured("answers", "docs/questions.md", 3, "--plot {folder}/answers.png"),
     "quality": Part(
         "docs/results.md",
         (

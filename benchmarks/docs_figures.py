@@ -232,7 +232,7 @@ def tasks(folder: Path) -> dict[str, str]:
                     "" if information else interval(gap[..., 1:].mean(-1))
                 )
                 rows.append(row)
-            tables[cell.replace("/", "-")] = table(rows)
+            tables[f"tasks-{cell.replace('/', '-')}"] = table(rows)
     return tables
 
 

@@ -218,7 +218,7 @@ def spoiled_pools() -> Iterator[Case]:
         "sparse": good.to_sparse(),
         "quantised": quantised,
         "of no query": good[:0],
-        "of one option": good[:, :1],
+        "of no options": good[:, :0],
         "of one feature": good[..., :1].clone(),
         "of two sizes": good[0].clone(),
         "expanded": torch.rand(1, 2, 3).expand(10**12, 2, 3),

@@ -133,10 +133,11 @@ def weigh_steps(settings: Settings, human: HumanBase, pool: QueryPool) -> Tensor
     weights = human.step_weights(1 if shown is None else shown.shape[2])
     if weights is None:
         return None
-    if shown is None:
+    if shown is None or settings["pool"]["train"] is not None:
         raise InputError(
-            f"human={settings['human']['name']} weighs the steps of trajectories, and the pool has "
-            "none; expected a pool with trajectories; choose another human"
+            f"human={settings['human']['name']} weighs the steps of trajectories, which only a "
+            "task tells and not a pool of your own; leave pool.train and pool.test out, or choose "
+            "another human"
         )
     steps = make("task", settings["task"]).step_features(shown)
     return torch.einsum("t,nktd->nkd", weights.to(steps), steps)

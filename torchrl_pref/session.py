@@ -89,7 +89,7 @@ class Session:
         normalizer: what the pool was normalised by, for :meth:`score` to apply to raw features.
         seed: fixes all luck.
         given: what the person, or each of the B, showed before the first question, by
-            ``questions.prior_evidence``: demonstrations and corrections.
+            ``questions.prior_evidence``: demonstrations and corrections, normalised as the pool.
 
     Raises:
         InputError: something is not what it should be.

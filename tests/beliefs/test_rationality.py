@@ -15,6 +15,7 @@ from torchrl_pref.beliefs.rationality import RationalityBelief
 from torchrl_pref.beliefs.sampled import uniform_sphere
 from torchrl_pref.beliefs.slice import ARC, MAX_SHRINKS, Target, compiled_moves, tensor_moves
 from torchrl_pref.errors import InputError
+from torchrl_pref.questions.prior_evidence import demonstration, evidence_of, rows_of_shown
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.questions.responses import Boltzmann, Optimal
 from torchrl_pref.session import Session
@@ -104,6 +105,31 @@ def test_samples_agree_with_importance_sampling(
     assert (np.abs(values.mean((0, 1)) - mean) / sd < 0.03 + 4 * error).all()
     assert (error**2 < 1 / 50 / sessions).all()  # the samples are worth at least 50 of their 100
     assert np.abs(np.square(values - mean).mean((0, 1)) / variance - 1).max() < 0.08
+
+
+@pytest.mark.parametrize("lapse", [0.0, 0.1])
+def test_what_was_shown_is_no_lapse(lapse: float, generator: Generator) -> None:
+    """Three demonstrations, each the best of 21 for the first feature, by importance sampling."""
+    model, belief = Boltzmann(2.0, lapse=lapse), RationalityBelief(Boltzmann(2.0, lapse=lapse))
+    others = torch.randn(3, 20, 3, generator=generator)
+    best = torch.tensor([2.5, 0.0, 0.0])
+    given = [demonstration(best, one) for one in others]
+    shown = evidence_of(rows_of_shown(given, 100, 3, model))
+    samples, ess = belief.prior(100, 3, generator), torch.full((100,), 100.0)
+    for g in range(1, 4):
+        samples, ess, _ = belief.update(samples, ess, shown[:, :g], generator)
+    rng = np.random.default_rng(0)
+    omega = rng.standard_normal((400_000, 3))
+    omega /= np.linalg.norm(omega, axis=1, keepdims=True)
+    log_s = rng.normal(0, np.log(3.0), len(omega))
+    returns = (best - others).double().numpy() @ omega.T  # (3 20 draws)
+    logits = np.clip(-2 * np.exp(log_s) * returns, -700, 700)
+    likely = -np.log1p(np.exp(logits).sum(1)).sum(0)
+    weights = np.exp(likely - likely.max())
+    values = np.concatenate([omega, log_s[:, None]], 1)
+    mean = weights @ values / weights.sum()
+    found = torch.cat([directions(samples), samples.norm(dim=-1, keepdim=True).log()], -1)
+    assert np.abs(found.double().mean((0, 1)).numpy() - mean).max() < 0.05
 
 
 @pytest.mark.parametrize("model", [Boltzmann(3.0), Boltzmann(3.0, lapse=0.2)], ids=str)

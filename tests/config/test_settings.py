@@ -82,6 +82,21 @@ def test_the_types_of_the_sections_name_the_keys_of_conf_and_their_values(
             assert isinstance(number, inner[name]), (key, name)
 
 
+@pytest.mark.parametrize(
+    ("typed", "message"),
+    [
+        (("belief=rationality", "tau=optimal"), "belief=rationality with tau=optimal"),
+        (("belief=laplace", "tau=[noisy,optimal]"), "belief=laplace with tau=optimal"),
+        (("belief=rationality", "tau=2", "belief.lapse=0.25"), "expected less than 0.25"),
+    ],
+)
+def test_what_a_belief_cannot_infer_is_refused_before_anything_runs(
+    typed: tuple[str, ...], message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        settings.check_evaluate_settings(composed("evaluate", *typed))
+
+
 def test_moves_may_be_left_to_the_belief() -> None:
     typed = composed("train")
     for moves in (None, 1, 16):

@@ -216,7 +216,7 @@ def test_a_spread_is_a_factor(spread: Any) -> None:
     refused(lambda: SimulatedHuman(MODEL, spread))
 
 
-@pytest.mark.parametrize("returns", [torch.rand(3, 1), torch.rand(0, 2), torch.rand(()), [0.5]])
+@pytest.mark.parametrize("returns", [torch.rand(3, 0), torch.rand(0, 2), torch.rand(()), [0.5]])
 def test_tau_is_calibrated_on_returns_of_options(returns: Any) -> None:
     refused(lambda: calibrate_tau(returns))
 

@@ -27,6 +27,7 @@ from torchrl_pref.questions.prior_evidence import (
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.questions.responses import Boltzmann, Optimal
 from torchrl_pref.questions.weak import Weak
+from torchrl_pref.session import Session
 from torchrl_pref.strategies import RandomQuery
 
 TAU, TAU_SHOWN, TAU_CORRECTED = 2.0, 3.5, 0.8
@@ -188,6 +189,13 @@ def test_a_demonstration_without_a_tau_is_as_careful_as_an_answer(generator: Gen
     assert torch.allclose(found, rows)
 
 
+@pytest.mark.parametrize("kind", [torch.float64, torch.int64])
+def test_features_of_any_type_can_be_shown(kind: torch.dtype) -> None:
+    given = [demonstration(torch.tensor([1, 2, 3]).to(kind), torch.ones(2, 3, dtype=kind))]
+    session = Session(torch.rand(30, 2, 3), Boltzmann(2.0), given=given)
+    assert session.weights.mean[2] > 0
+
+
 def test_what_cannot_be_shown_is_refused() -> None:
     one, many = torch.ones(3), torch.ones(4, 3)
     model = Boltzmann(1.0)
@@ -201,6 +209,7 @@ def test_what_cannot_be_shown_is_refused() -> None:
         (lambda: rows_of_shown([correction(one, one)], 1, 4, model), "with D=4"),
         (lambda: rows_of_shown([correction(many, many)], 2, 3, model), "of each of 2"),
         (lambda: rows_of_shown([correction(one, one, 2.0)], 1, 3, Optimal()), "never errs"),
+        (lambda: rows_of_shown(demonstration(one, many), 1, 3, model), "expected a list"),
         (lambda: Demonstrations(-1), "demonstrations.count=-1"),
         (lambda: Demonstrations(1, 0), "demonstrations.alternatives=0"),
         (lambda: Demonstrations(1, tau=-1.0), "tau=-1"),

@@ -19,7 +19,8 @@ import pytest
 from safetensors.numpy import save_file
 
 from torchrl_pref.errors import InputError
-from torchrl_pref.storage.tables import MAX_COLUMNS, read_columns
+from torchrl_pref.storage.columns import MAX_COLUMNS
+from torchrl_pref.storage.tables import read_columns
 
 X = np.random.default_rng(0).normal(size=(40, 3))
 NAMES = ("speed", "lane", "jerk")
@@ -162,6 +163,16 @@ def bomb() -> bytes:
 
 
 BAD: dict[str, tuple[str, Callable[[], bytes | str], str]] = {
+    "npz: many empty names": (
+        ".npz",
+        lambda: npz(features=X, feature_names=np.empty(10**7, "<U0")),
+        "expected numbers",
+    ),
+    "npz: small numbers that grow": (
+        ".npz",
+        lambda: zipped({"features.npy": npy((2**23 + 1, 1), bytes(2**23 + 1), "|u1")}, packed=True),
+        "would take 67 MB",
+    ),
     "csv: nothing": (".csv", lambda: "", "shape"),
     "csv: header alone": (".csv", lambda: "speed,lane\n", "shape"),
     "csv: NaN": (".csv", lambda: csv_text(with_nan()), "'lane' holds NaN or infinity in row 7"),

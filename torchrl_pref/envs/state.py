@@ -24,6 +24,7 @@ MEANING = {
     "human.omega": "sessions and features",
     "human.noise": "sessions, asks (the budget) and answers",
     "human.care": "sessions and one factor",
+    "human.walk": "sessions, questions and features",
     "session.samples": "sessions, samples of the belief and features",
     "session.mean": "sessions and features",
     "session.given.rows": "sessions, demonstrations, alternatives and features",
@@ -107,7 +108,7 @@ def _name(key: Any) -> str:
 def _check_part(name: str, value: Tensor, expected: Tensor) -> Tensor:
     """One part of the state, in the type and on the device of a fresh one."""
     check_plain(name, value)
-    meaning = MEANING.get(name, "sessions and one number")
+    meaning = MEANING.get(name, "as a fresh session has it")
     check_shape(
         name,
         value,

@@ -72,7 +72,7 @@ def demonstration(shown: Tensor, alternatives: Tensor, tau: float | None = None)
         )
     if alternatives.shape[-2] == 0:
         raise InputError("alternatives of shape (… 0 D): expected at least one to be preferred to")
-    return Shown(shown.unsqueeze(-2) - alternatives, check_tau(tau))
+    return Shown(shown.float().unsqueeze(-2) - alternatives.float(), check_tau(tau))
 
 
 def correction(after: Tensor, before: Tensor, tau: float | None = None) -> Shown:
@@ -112,6 +112,11 @@ def rows_of_shown(
     Raises:
         InputError: features are not those of B people, or the model has no tau to compare with.
     """
+    if not isinstance(shown, Sequence) or not all(isinstance(one, Shown) for one in shown):
+        raise InputError(
+            f"given of type {type(shown).__name__}: expected a list of what demonstration(…) and "
+            "correction(…) make, as in given=[demonstration(…)]"
+        )
     most = max(one.rows.shape[-2] for one in shown)
     rows, offsets = [], []
     for one in shown:

@@ -18,65 +18,27 @@ import csv
 import math
 import zipfile
 from array import array
-from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple, TextIO, TypeAlias
+from typing import Any, TextIO
 
 import numpy as np
 import torch
 
 from torchrl_pref.errors import InputError
+from torchrl_pref.storage.columns import (
+    ALWAYS,
+    KIND,
+    MAX_COLUMNS,
+    NAMES,
+    RATIO,
+    Choice,
+    Columns,
+    Refused,
+    of_arrays,
+)
 from torchrl_pref.storage.files import MAX_FILE, PIECE, Piecewise, size_of
-from torchrl_pref.tensors import default_names
-
-Columns: TypeAlias = dict[str, "np.ndarray[Any, Any]"]
-"""By name, numbers or texts (N) or (N K)."""
-
-RATIO, ALWAYS = 100, 2**26
-"""A file may unpack to so many times its size, and always to so many bytes."""
-
-ARRAY = "features"
-NAMES = "feature_names"
-
-KIND = "file of features"
-
-
-MAX_COLUMNS = 10_000
-
-
-class Refused(Exception):
-    """Why a file is refused, without its path."""
-
-
-class Choice(NamedTuple):
-    """Which columns are read."""
-
-    wanted: Collection[str] | None
-    """Those of numbers; None: all but that of texts."""
-    texts: str | None
-    """That of texts; None: there is none."""
-
-    def pick(self, there: Sequence[str]) -> list[str]:
-        """The names to read, of those that are there.
-
-        Raises:
-            Refused: one is there twice, or is not there, or there are too many.
-        """
-        if len(there) > MAX_COLUMNS:
-            raise Refused(f"holds {len(there)} columns; expected at most {MAX_COLUMNS}")
-        for name, count in Counter(there).items():
-            if count > 1:
-                raise Refused(f"holds the column {name!r:.80} twice; rename one")
-        wanted = list(there if self.wanted is None else self.wanted)
-        if self.texts is not None:
-            wanted = [name for name in wanted if name != self.texts] + [self.texts]
-        missing = [name for name in wanted if name not in there]
-        if missing:
-            raise Refused(
-                f"holds no column {missing[0]!r:.80}; expected one of {', '.join(there)!s:.300}"
-            )
-        return wanted
+from torchrl_pref.storage.parquet import read_parquet
 
 
 def read_columns(
@@ -210,14 +172,16 @@ def _npz(path: str, limit: int, choice: Choice) -> Columns:
             )
 
         def load(name: str) -> np.ndarray[Any, Any]:
-            return _array(archive, members[name], name)
+            return _array(archive, members[name], name, limit)
 
         labels = load(NAMES).tolist() if NAMES in members else None
-        return _of_arrays([name for name in members if name != NAMES], load, labels, choice)
+        return of_arrays([name for name in members if name != NAMES], load, labels, choice)
 
 
-def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo, name: str) -> np.ndarray[Any, Any]:
-    """One array of an NPZ, once its header fits the bytes that are there.
+def _array(
+    archive: zipfile.ZipFile, member: zipfile.ZipInfo, name: str, limit: int
+) -> np.ndarray[Any, Any]:
+    """One array of an NPZ, once its header fits the bytes that are there and the limit.
 
     Raises:
         Refused: it does not, or the array is one of Python objects, which is a pickle.
@@ -233,15 +197,34 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo, name: str) -> np.n
                 f"array {name!r:.80} holds {dtype}; expected numbers, or texts as names; Python "
                 "objects are pickles, which are never read"
             )
+        if not dtype.itemsize or (name == NAMES and math.prod(shape) > MAX_COLUMNS):
+            raise Refused(
+                f"array {name!r:.80} of shape {shape} holds {dtype}; expected numbers, or at most "
+                f"{MAX_COLUMNS} names"
+            )
         if math.prod(shape) * dtype.itemsize + file.tell() != member.file_size:
             raise Refused(
                 f"array {name!r:.80} says that it is {shape} of {dtype}, and {member.file_size} "
                 "bytes are there; save it again"
             )
+    check_room(name, math.prod(shape), limit)
     with archive.open(member) as file:
         values: np.ndarray[Any, Any] = np.lib.format.read_array(file, allow_pickle=False)
         file.read(1)  # the end, where the checksum is compared
     return values
+
+
+def check_room(name: str, count: int, limit: int) -> None:
+    """Refuse numbers that would take more bytes than the limit, as float64.
+
+    Raises:
+        Refused: they would.
+    """
+    if 8 * count > limit:
+        raise Refused(
+            f"array {name!r:.80} of {count:,} numbers would take {8 * count / 1e6:.0f} MB; "
+            f"expected at most {limit / 1e6:.0f} MB from a file of its size; leave some out"
+        )
 
 
 def _safetensors(path: str, limit: int, choice: Choice) -> Columns:
@@ -251,91 +234,20 @@ def _safetensors(path: str, limit: int, choice: Choice) -> Columns:
     with safe_open(path, framework="pt") as file:
 
         def load(name: str) -> np.ndarray[Any, Any]:
+            check_room(name, math.prod(file.get_slice(name).get_shape()), limit)
             tensor = file.get_tensor(name)
             values: np.ndarray[Any, Any] = tensor.to(torch.float64, copy=True).numpy()
             return values
 
         labels = (file.metadata() or {}).get(NAMES)
         named = None if labels is None else [name.strip() for name in labels.split(",")]
-        return _of_arrays(list(file.keys()), load, named, choice)
-
-
-def _of_arrays(
-    there: list[str],
-    load: Callable[[str], np.ndarray[Any, Any]],
-    labels: list[str] | None,
-    choice: Choice,
-) -> Columns:
-    """Columns from arrays: each is one, or one holds them all."""
-    if ARRAY not in there:
-        return {name: load(name) for name in choice.pick(there)}
-    features = load(ARRAY)
-    if features.ndim not in (2, 3) or features.shape[-1] > MAX_COLUMNS:
-        raise Refused(
-            f"{ARRAY} of shape {features.shape}; expected (N trajectories, D) or "
-            f"(N queries, K options, D), with D at most {MAX_COLUMNS}"
-        )
-    names = default_names(features.shape[-1]) if labels is None else labels
-    if not isinstance(names, (list, tuple)) or len(names) != features.shape[-1]:
-        raise Refused(f"{NAMES} of other length than the {features.shape[-1]} features")
-    names = [str(name) for name in names]
-    beside = [name for name in there if name == choice.texts]
-    chosen = choice.pick([*names, *beside])
-    return {
-        name: features[..., names.index(name)] if name in names else load(name) for name in chosen
-    }
-
-
-def _parquet(path: str, limit: int, choice: Choice) -> Columns:
-    """Columns of a Parquet file."""
-    import pyarrow.parquet as parquet
-    from pyarrow import types
-
-    texts = [] if choice.texts is None else [choice.texts]
-    # Texts that come again and again are kept once, so that few bytes cannot become many.
-    with parquet.ParquetFile(path, read_dictionary=texts) as file:
-        schema, metadata = file.schema_arrow, file.metadata
-        # Pandas writes its row labels as a column.
-        there = [name for name in schema.names if not name.startswith("__index_level_")]
-        chosen = choice.pick(there)
-        for name in chosen:
-            kind = schema.field(name).type
-            number = types.is_integer(kind) or types.is_floating(kind) or types.is_boolean(kind)
-            if not number and name != choice.texts:
-                raise Refused(
-                    f"column {name!r} holds {kind!s:.40}; expected numbers; name those that do by "
-                    "columns=[…]"
-                )
-        groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
-        claimed = sum(group.total_byte_size for group in groups)
-        claimed = max(claimed, 8 * metadata.num_rows * len(chosen))
-        if not 0 <= claimed <= limit:
-            raise Refused(
-                f"says that it unpacks to {claimed / 1e6:.0f} MB; expected at most "
-                f"{limit / 1e6:.0f} MB from a file of its size"
-            )
-        table = file.read(columns=chosen, use_threads=False)
-    missing = [name for name in chosen if table.column(name).null_count]
-    if missing:
-        raise Refused(f"column {missing[0]!r} lacks values; expected a number in each row")
-    columns: Columns = {}
-    for name in chosen:
-        column = table.column(name)
-        if name == choice.texts:
-            values: list[str] = []
-            for chunk in column.chunks:
-                once = chunk.dictionary.to_pylist()
-                values += [once[code] for code in chunk.indices.to_pylist()]
-            columns[name] = np.array(values, dtype=object)
-        else:
-            columns[name] = column.to_numpy()
-    return columns
+        return of_arrays(list(file.keys()), load, named, choice)
 
 
 READERS: dict[str, Callable[[str, int, Choice], Columns]] = {
     ".npz": _npz,
     ".csv": _csv,
-    ".parquet": _parquet,
+    ".parquet": read_parquet,
     ".safetensors": _safetensors,
 }
 """By ending: from a path, the bytes that it may unpack to, and the columns to read."""

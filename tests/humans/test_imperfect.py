@@ -126,7 +126,7 @@ def test_steps_that_nobody_knows_are_refused() -> None:
     settings = settings_of("query")
     pool = make_pools(settings)[0]
     without = type(pool)(pool.features)
-    with pytest.raises(InputError, match="the pool has none"):
+    with pytest.raises(InputError, match="which only a task tells"):
         weigh_steps(settings, Myopic(Optimal()), without)
     assert weigh_steps(settings, SimulatedHuman(Optimal()), without) is None
 

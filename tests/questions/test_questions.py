@@ -113,7 +113,7 @@ def test_the_posterior_is_that_of_the_probabilities(
     )
     mean = weights @ points
     covariance = (points * weights[:, None]).T @ points - torch.outer(mean, mean)
-    sessions, belief = 100 if in_tensors else 400, Belief(model)
+    sessions, belief = 40 if in_tensors else 400, Belief(model)
     samples, ess = belief.prior(sessions, 3, generator), torch.full((sessions,), 100.0)
     for h in range(1, len(queries) + 1):
         evidence = model.evidence(queries[:h], answers[:h]).expand(sessions, h)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import difflib
 import os
 import re
 import shlex
@@ -97,7 +98,7 @@ def refusals() -> Iterator[None]:
             "",
             " ".join(str(error).split()),
         )
-        raise InputError(f"{text}; --help lists the keys and their values") from None
+        raise InputError(f"{text}{_meant(text)}; --help lists the keys and their values") from None
     except Exception as error:
         if Gate.passed or isinstance(error, (InputError, OSError)):
             raise
@@ -105,6 +106,33 @@ def refusals() -> Iterator[None]:
             f"{shlex.join(sys.argv[1:])}: cannot be read ({type(error).__name__}: {error}); --help "
             "lists the keys and their values"
         ) from None
+
+
+def _meant(text: str) -> str:
+    """The key that somebody may have meant, where Hydra says that there is no such."""
+    typed = re.search(r"Could not override '([\w.]+)'", text)
+    if typed is None:
+        return ""
+    known: set[str] = set()
+    for path in sorted((Path(__file__).parent / "conf").rglob("*.yaml")):
+        group = path.parent.name if path.parent.name != "conf" else ""
+        plain = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
+        known |= {group} | (_keys(plain, f"{group}." if group else ""))
+    close = difflib.get_close_matches(typed[1], sorted(known - {""}), 1, 0.75)
+    ends = [key for key in sorted(known) if key.endswith(f".{typed[1]}")]
+    if typed[1] in known:
+        return f"; {typed[1]} belongs to another choice than the one made here"
+    return "".join(f"; did you mean {key}?" for key in (close or ends)[:1])
+
+
+def _keys(plain: Any, prefix: str) -> set[str]:
+    """The dotted keys of a file of settings."""
+    if not isinstance(plain, dict):
+        return set()
+    keys = {f"{prefix}{key}" for key in plain if key not in ("defaults", "hydra", "name")}
+    return keys.union(
+        *(_keys(value, f"{prefix}{key}.") for key, value in plain.items() if key != "hydra")
+    )
 
 
 @contextlib.contextmanager

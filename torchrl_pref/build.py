@@ -172,7 +172,10 @@ def make_task(
     own = solved if human["tau"] is None else solve_tau(human["tau"], train)
     who = Human(own, human["lapse"], _kind_of(human))
     lapse = settings["belief"]["lapse"]
-    task = Problem(train, test, normalizer, solved, question, who, lapse)
+    name = "" if settings["task"]["name"] == "gridworld" else settings["task"]["name"]
+    pools_of = "own pools" if settings["pool"]["train"] is not None else name
+    infers = "tau" if settings["belief"]["name"] == "rationality" else ""
+    task = Problem(train, test, normalizer, solved, question, who, lapse, pools_of, infers)
     for model in (task.human_model, task.response_model):
         model.n_answers(train.n_options)  # or it is refused here
     return task

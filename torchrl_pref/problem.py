@@ -14,6 +14,7 @@ from torch import Generator
 from torchrl_pref.beliefs.sampled import uniform_sphere
 from torchrl_pref.errors import InputError, check_positive
 from torchrl_pref.pool import Normalizer, QueryPool
+from torchrl_pref.questions import QUESTIONS
 from torchrl_pref.questions.base import Question
 from torchrl_pref.questions.calibrate import calibrate_tau
 from torchrl_pref.questions.choice import Choice
@@ -50,6 +51,8 @@ class Problem:
         question: what is asked.
         human: who answers; None: whom the belief expects, but without lapses.
         belief_lapse: share of answers that the belief takes to be given at random.
+        task: what the pools are of, where it is not the Gridworld.
+        infers: what the belief infers beside ω, in words.
     """
 
     train: QueryPool
@@ -59,11 +62,18 @@ class Problem:
     question: Question = field(default_factory=Choice)
     human: Human | None = None
     belief_lapse: float = 0.0
+    task: str = ""
+    infers: str = ""
 
     @property
     def title(self) -> str:
-        """What kind of human this is, and what the belief takes them for where that is another, for
-        tables and figures."""
+        """The task, what kind of human this is, and what the belief takes them for where that is
+        another, for tables and figures."""
+        title = f"{self.task}, {self._who}" if self.task else self._who
+        return f"{title}; {self.infers} inferred" if self.infers else title
+
+    @property
+    def _who(self) -> str:
         human = self._human
         errs = [] if human.tau is None else [f"tau={human.tau:.4g}"]
         errs += [f"lapse={human.lapse:g}"] if human.lapse else []
@@ -72,7 +82,7 @@ class Problem:
         if human.kind:
             who = f"{who}, {human.kind}"
         if type(self.question) is not Choice:
-            who = f"{who}, {self.question!r}"
+            who = f"{who}, {named(self.question)}"
         if not human.kind and (human.tau, human.lapse) == (self.tau, self.belief_lapse):
             return who
         assumed = "optimal" if self.tau is None else f"tau={self.tau:.4g}"
@@ -92,6 +102,13 @@ class Problem:
     @property
     def _human(self) -> Human:
         return Human(self.tau) if self.human is None else self.human
+
+
+def named(question: Question) -> str:
+    """A kind of question in words, with its numbers."""
+    kinds = {kind: name.replace("_", " ") for name, kind in QUESTIONS.items()}
+    numbers = [f"{key}={value}" for key, value in vars(question).items()]
+    return " ".join([kinds.get(type(question), type(question).__name__), "questions", *numbers])
 
 
 def solve_tau(tau: Any, pool: QueryPool) -> float | None:

@@ -166,3 +166,8 @@ def test_a_tau_of_their_own_and_what_a_title_says() -> None:
     settings["belief"]["lapse"] = 0.05
     found = make_task(*pools, 4.0, settings).title
     assert found == "optimal human (lapse=0.1), drifting drift=0.1; assumed tau=4, lapse=0.05"
+    settings = settings_of("query")
+    settings["task"], settings["belief"]["name"] = {"name": "driver"}, "rationality"
+    settings["question"] = {"name": "weak", "threshold": 1.0}
+    found = make_task(*pools, 4.0, settings).title
+    assert found == "driver, noisy human (tau=4), weak questions threshold=1.0; tau inferred"

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
+from textwrap import fill
 
 import matplotlib
 from torch import Tensor
@@ -33,6 +34,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+TITLE = 46
+"""Letters of a panel's title in a line."""
+
 
 def figure_1(records: Records, path: Path) -> None:
     """The paper's Figure 1: alignment against the number of queries, a panel for each task."""
@@ -49,7 +53,12 @@ def figure_1(records: Records, path: Path) -> None:
         own = records.of_task(task)
         for key in own.strategies:
             _draw(axis, key, alignment(own, key), styles)
-        axis.set(title=title_of(task), xlabel="queries asked", xlim=(0, None), ylim=(None, 1.02))
+        axis.set(
+            title=fill(title_of(task), TITLE),
+            xlabel="queries asked",
+            xlim=(0, None),
+            ylim=(None, 1.02),
+        )
         _finish(axis)
     for row in axes:
         row[0].set_ylabel("alignment (mean of cosines)")
@@ -76,7 +85,7 @@ def heldout_figure(records: Records, path: Path) -> None:
     for (above, below), task in zip(axes.T, tasks, strict=True):
         own = records.of_task(task)
         _draw_cell(above, below, own, styles)
-        above.set(title=title_of(task), ylim=(0, 1.02))
+        above.set(title=fill(title_of(task), TITLE), ylim=(0, 1.02))
         below.set(xlabel="queries asked")
         for axis in (above, below):
             _finish(axis)

@@ -25,7 +25,7 @@ def read_parquet(path: str, limit: int, choice: Choice) -> Columns:
             if not number and name != choice.texts:
                 raise Refused(
                     f"column {name!r} holds {kind!s:.40}; expected numbers; name those that do by "
-                    "columns=[…]"
+                    "task.columns=[…]"
                 )
         groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
         claimed = sum(group.total_byte_size for group in groups)

@@ -76,6 +76,8 @@ def read_columns(
         ) from None
     except Refused as error:
         raise InputError(f"{path}: {error}") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: is not in UTF-8; save it as UTF-8") from None
     except Exception as error:  # whatever the reader trips over, the file is at fault
         raise InputError(
             f"{path}: cannot be read as {suffix} (cut off, spoiled, or something else: "
@@ -90,6 +92,8 @@ def _checked(columns: Columns, choice: Choice) -> Columns:
         Refused: they differ in shape, or hold what is no finite number.
     """
     shape = next(iter(columns.values())).shape if columns else (0,)
+    if len(shape) in (1, 2) and shape[0] == 0:
+        raise Refused("holds no trajectories; expected names, and a line of numbers for each")
     if len(shape) not in (1, 2) or 0 in shape:
         raise Refused(f"columns of shape {shape}; expected (N) or (N, K), with N at least 1")
     checked: Columns = {}
@@ -104,7 +108,7 @@ def _checked(columns: Columns, choice: Choice) -> Columns:
         if values.dtype.kind not in "biuf":
             raise Refused(
                 f"column {name!r} holds {values.dtype}; expected numbers; name those that do by "
-                "columns=[…]"
+                "task.columns=[…]"
             )
         checked[name] = values.astype(np.float64)
         bad = np.argwhere(~np.isfinite(checked[name]))
@@ -122,6 +126,11 @@ def _csv(path: str, limit: int, choice: Choice) -> Columns:
     with open(path, encoding="utf-8-sig", newline="") as file:
         lines = csv.reader(_lines(file), strict=True)
         header = [name.strip() for name in next(lines, [])]
+        if header and all(is_number(name) for name in header):
+            raise Refused(
+                f"has no names in its first line ({', '.join(header)!s:.80}); expected a header of "
+                "names, with commas"
+            )
         chosen = [name for name in choice.pick(header) if name != choice.texts]
         places = [header.index(name) for name in chosen]
         named_in = None if choice.texts is None else header.index(choice.texts)
@@ -139,7 +148,7 @@ def _csv(path: str, limit: int, choice: Choice) -> Columns:
                 except ValueError:
                     raise Refused(
                         f"line {lines.line_num} has {cells[place]!r:.40} in column {name!r:.80}; "
-                        "expected a number; mend it, or name the columns of numbers by columns=[…]"
+                        "expected a number; mend it, or name those of numbers by task.columns=[…]"
                     ) from None
             if named_in is not None:
                 named.append(cells[named_in].strip())
@@ -148,6 +157,15 @@ def _csv(path: str, limit: int, choice: Choice) -> Columns:
     if choice.texts is not None:
         columns[choice.texts] = np.array(named, dtype=object)
     return columns
+
+
+def is_number(text: str) -> bool:
+    """Whether it is a number and no name."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _lines(file: TextIO) -> Iterator[str]:

@@ -57,7 +57,8 @@ class Task(ABC):
     def scene(self, trajectory: Tensor) -> Scene:
         """What a person is shown of one trajectory (T …); the features as bars, where a task has
         nothing better."""
-        return feature_bars(self.feature_names, self.features(trajectory))
+        features = self.features(trajectory)
+        return feature_bars(self.feature_names, features, features)
 
 
 def make_pool(task: Task, n_queries: int, n_options: int, seed: int) -> QueryPool:
@@ -79,12 +80,14 @@ def make_pool(task: Task, n_queries: int, n_options: int, seed: int) -> QueryPoo
     return QueryPool(features, trajectories, task.feature_names)
 
 
-def feature_bars(names: tuple[str, ...], features: Tensor) -> Scene:
-    """Named features (D) as bars, in one frame."""
+def feature_bars(names: tuple[str, ...], features: Tensor, sizes: Tensor) -> Scene:
+    """Named features (D) as bars of these sizes (D), in one frame."""
     bars: list[Shape] = []
-    for row, (name, value) in enumerate(zip(names, features.tolist(), strict=True)):
+    for row, (name, value, size) in enumerate(
+        zip(names, features.tolist(), sizes.tolist(), strict=True)
+    ):
         low, high = -row - 0.8, -row - 0.4
-        bars.append(Patch(((0.0, low), (value, low), (value, high), (0.0, high)), "#4477aa"))
+        bars.append(Patch(((0.0, low), (size, low), (size, high), (0.0, high)), "#4477aa"))
         bars.append(Label((0.0, -row - 0.2), f"{name}: {value:.3g}"))
-    reach = max(1e-9, float(features.abs().max())) * 1.1
+    reach = max(1e-9, float(sizes.abs().max())) * 1.1
     return Scene((-reach, -float(len(names))), (reach, 0.0), (), (tuple(bars),), equal=False)

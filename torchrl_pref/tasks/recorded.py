@@ -13,7 +13,8 @@ import torch
 from torch import Generator, Tensor
 
 from torchrl_pref.errors import InputError
-from torchrl_pref.tasks.base import Task
+from torchrl_pref.tasks.base import Task, feature_bars
+from torchrl_pref.tasks.scene import Scene
 
 Self = TypeVar("Self", bound="RecordedTask")
 
@@ -45,6 +46,14 @@ class RecordedTask(Task):
             half._rows = self._rows[chosen]
             halves.append(half)
         return halves[0], halves[1]
+
+    def scene(self, trajectory: Tensor) -> Scene:
+        """See :meth:`Task.scene`: the features as bars, each as far from its mean over all
+        trajectories as there are standard deviations, at most three."""
+        features = self.features(trajectory)
+        deviation, mean = torch.std_mean(self._features, 0)
+        sizes = ((features - mean) / deviation.clamp(min=1e-12)).clamp(-3, 3)
+        return feature_bars(self.feature_names, features, sizes)
 
     def trajectories(self, count: int, seed: int) -> Tensor:
         """See :meth:`Task.trajectories`: (count 1) int64, numbers of trajectories; they come again

@@ -93,5 +93,6 @@ class LapseRates:
         product = self.model.log_likelihood(gaps).sum(-1).unsqueeze(-1)
         floor = answers.floor[:, None, :, None] * self.odds.to(gaps)
         likely = torch.logaddexp(product, floor.log()) + (1 - self.rates.to(gaps)).log()
-        # What is no answer has no floor, and says nothing of how often people lapse.
-        return likely * (answers.floor > 0)[:, None, :, None]
+        # What was shown is no lapse, and has no floor; what is no answer has none and a product of
+        # 1. Neither says anything of how often people lapse.
+        return torch.where(answers.floor[:, None, :, None] > 0, likely, product)

@@ -31,10 +31,10 @@ from torchrl_pref.config.checks import (
 )
 from torchrl_pref.config.memory import check_memory
 from torchrl_pref.config.sections import Plain, Settings
+from torchrl_pref.config.together import check_together
 from torchrl_pref.errors import (
     InputError,
     check_choice,
-    check_count,
     check_flag,
     check_seed,
     check_share,
@@ -143,9 +143,6 @@ OTHERS: dict[str, dict[str, dict[str, Check]]] = {
 }
 """Of the other groups. What is not in here is checked by what is made of it: ``open_groups``."""
 
-OF_ONE = ("approve", "own")
-"""Kinds of question that may be about one option."""
-
 PRETRAINED: dict[str, dict[str, Check]] = {"pretrained": {}}
 """The policies that evaluate.py can be asked for by name."""
 
@@ -189,7 +186,7 @@ def check_run(settings: Plain) -> Settings:
     """
     own = {key: value for key, value in settings.items() if key not in (*TRAIN_DOOR, "overrides")}
     _check_keys(own, TASK | TRAINING, OF_TRAINING)
-    _check_together(own)
+    check_together(own)
     setup, policy = own["setup"], own["policy"]
     if setup["name"] == "feed" and policy.get("start") is not None:
         raise InputError(
@@ -211,7 +208,7 @@ def check_evaluate_settings(settings: Plain) -> Settings:
     if "policy" in settings:
         groups = {**groups, "policy": PRETRAINED}
     _check_keys(settings, TASK | EVALUATE, groups)
-    _check_together(settings)
+    check_together(settings)
     if "policy" in settings:
         one_or_more(choice("noisy", "optimal"))("tau", settings["tau"])
         if settings["setup"]["name"] == "feed" and settings["skip"] != "free":
@@ -294,52 +291,3 @@ def _chosen(settings: Plain) -> str:
     """The groups that decide which keys there are."""
     groups = {group: settings.get(group, {}).get("name") for group in OF_TRAINING}
     return " and ".join(f"{group}={name}" for group, name in groups.items() if name is not None)
-
-
-def _check_together(settings: Plain) -> None:
-    """Refuse values that are right one by one and wrong together."""
-    pool, setup, belief = settings["pool"], settings["setup"], settings["belief"]
-    _check_demonstrations(settings)
-    given = [name for name in ("train", "test") if pool[name] is not None]
-    if len(given) == 1 and settings.get("checkpoint") is None:
-        raise InputError(
-            f"pool.{given[0]}={pool[given[0]]} alone: the other pool would be the task's; "
-            "expected both pool.train and pool.test of your own, or neither"
-        )
-    if settings["question"]["name"] not in OF_ONE:
-        check_count("pool.options", pool["options"], 2)
-    budget = setup["budget"]
-    if setup["name"] == "feed":
-        if setup["offers"] is not None:
-            check_count("setup.offers", setup["offers"], budget)
-    elif not setup["repeats"] and pool["train"] is None:
-        shown = min(pool["size"], setup["candidates"] or pool["size"])
-        if shown < budget:
-            raise InputError(
-                f"setup.repeats=false with {shown} candidates and setup.budget={budget}: expected "
-                "at least as many candidates as asks; raise one or lower the other"
-            )
-    if settings["objective"] == "entropy" and belief.get("samples", 4) < 4:
-        raise InputError(
-            f"objective=entropy with belief.samples={belief['samples']}: expected at least 4, as "
-            "the entropy is told by the third nearest sample; raise belief.samples"
-        )
-
-
-def _check_demonstrations(settings: Plain) -> None:
-    """Refuse demonstrations that the pool has not enough trajectories for, or the belief no tau."""
-    shown, pool = settings["demonstrations"], settings["pool"]
-    if not shown["count"]:
-        return
-    walks = pool["size"] * pool["options"]
-    if pool["train"] is None and shown["alternatives"] >= walks:
-        raise InputError(
-            f"demonstrations.alternatives={shown['alternatives']} with {walks} trajectories in the "
-            "pool: expected fewer; lower it, or raise pool.size"
-        )
-    taus = settings["tau"] if isinstance(settings["tau"], list) else [settings["tau"]]
-    if shown["tau"] is not None and "optimal" in taus:
-        raise InputError(
-            f"demonstrations.tau={shown['tau']} with tau=optimal: to a belief in a human who never "
-            "errs nothing is shown less carefully; leave demonstrations.tau out, or set tau=noisy"
-        )

@@ -1,0 +1,94 @@
+"""Values of settings that are right one by one and wrong together."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torchrl_pref.config.sections import Plain
+from torchrl_pref.errors import InputError, check_count
+
+OF_ONE = ("approve", "own")
+"""Kinds of question that may be about one option."""
+
+LARGEST_RATE = 4.0
+"""Of the lapse rates that are thought possible, in units of their mean, see ``beliefs.lapses``."""
+
+
+def check_together(settings: Plain) -> None:
+    """Refuse values that are right one by one and wrong together.
+
+    Raises:
+        InputError: some are.
+    """
+    pool, setup, belief = settings["pool"], settings["setup"], settings["belief"]
+    _check_demonstrations(settings)
+    _check_belief(settings)
+    given = [name for name in ("train", "test") if pool[name] is not None]
+    if len(given) == 1 and settings.get("checkpoint") is None:
+        raise InputError(
+            f"pool.{given[0]}={pool[given[0]]} alone: the other pool would be the task's; "
+            "expected both pool.train and pool.test of your own, or neither"
+        )
+    if settings["question"]["name"] not in OF_ONE:
+        check_count("pool.options", pool["options"], 2)
+    budget = setup["budget"]
+    if setup["name"] == "feed":
+        if setup["offers"] is not None:
+            check_count("setup.offers", setup["offers"], budget)
+    elif not setup["repeats"] and pool["train"] is None:
+        shown = min(pool["size"], setup["candidates"] or pool["size"])
+        if shown < budget:
+            raise InputError(
+                f"setup.repeats=false with {shown} candidates and setup.budget={budget}: expected "
+                "at least as many candidates as asks; raise one or lower the other"
+            )
+    if settings["objective"] == "entropy" and belief.get("samples", 4) < 4:
+        raise InputError(
+            f"objective=entropy with belief.samples={belief['samples']}: expected at least 4, as "
+            "the entropy is told by the third nearest sample; raise belief.samples"
+        )
+
+
+def _check_demonstrations(settings: Plain) -> None:
+    """Refuse demonstrations that the pool has not enough trajectories for, or the belief no tau."""
+    shown, pool = settings["demonstrations"], settings["pool"]
+    if not shown["count"]:
+        return
+    walks = pool["size"] * pool["options"]
+    if pool["train"] is None and shown["alternatives"] >= walks:
+        raise InputError(
+            f"demonstrations.alternatives={shown['alternatives']} with {walks} trajectories in the "
+            "pool: expected fewer; lower it, or raise pool.size"
+        )
+    if shown["tau"] is not None and "optimal" in _taus(settings):
+        raise InputError(
+            f"demonstrations.tau={shown['tau']} with tau=optimal: to a belief in a human who never "
+            "errs nothing is shown less carefully; leave demonstrations.tau out, or set tau=noisy"
+        )
+
+
+def _check_belief(settings: Plain) -> None:
+    """Refuse a human whom the belief cannot infer."""
+    belief = settings["belief"]
+    name = belief["name"]
+    if name in ("rationality", "laplace") and "optimal" in _taus(settings):
+        raise InputError(
+            f"belief={name} with tau={_typed(settings['tau'])}: it can infer nothing of humans who "
+            "never err; type tau=noisy, or belief=sampled"
+        )
+    if name == "rationality" and belief["lapse"] * LARGEST_RATE >= 1:
+        raise InputError(
+            f"belief.lapse={belief['lapse']} with belief=rationality: some people are taken to "
+            f"lapse {LARGEST_RATE:g} times as often; expected less than {1 / LARGEST_RATE:g}; "
+            "lower it, or type belief=sampled"
+        )
+
+
+def _taus(settings: Plain) -> list[Any]:
+    """The kinds of human, one or several."""
+    return settings["tau"] if isinstance(settings["tau"], list) else [settings["tau"]]
+
+
+def _typed(value: Any) -> str:
+    """A value, or a list of them, as it is typed."""
+    return f"[{','.join(map(str, value))}]" if isinstance(value, list) else str(value)

@@ -119,7 +119,7 @@ def test_samples_agree_with_importance_sampling(
 
 @pytest.mark.parametrize("model", [Boltzmann(2.0), Boltzmann(2.0, lapse=0.2)], ids=str)
 def test_demonstrations_agree_with_importance_sampling(
-    model: Boltzmann, generator: Generator
+    model: Boltzmann, generator: Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What was shown is no lapse, and counts whatever the lapse rate is believed to be."""
     options = torch.randn(4, 2, 3, generator=generator)
@@ -128,8 +128,9 @@ def test_demonstrations_agree_with_importance_sampling(
     rows = torch.randn(3, 4, 3, generator=generator)
     rows *= (rows @ omega).sum(-1, keepdim=True).sign().unsqueeze(-1)
     mean, variance = reference(options, answers, model, 3.0, rows)
-    # With one move each the samples must be right when they are reweighted.
-    sessions, belief = 150, RationalityBelief(model, moves=1)
+    # Without moves, which would mend them, the samples must be right when they are reweighted.
+    monkeypatch.setattr(RationalityBelief, "_move", lambda self, samples, *_: samples)
+    sessions, belief = 20, RationalityBelief(model, samples=4000)
     given: Given = {
         "rows": rows.expand(sessions, -1, -1, -1),
         "offsets": torch.zeros(sessions, 3, 4),

@@ -277,7 +277,7 @@ def test_the_estimate_knows_the_gaussian_belief() -> None:
     small = part(what, *given, "setup.budget=30", "evaluation.humans=1000")
     assert small == 8.0 * memory.LAPLACE_COPIES * memory.LAPLACE_HELD
     assert part(what, *given, "setup.budget=9000") > 8.0 * 9000**2
-    given += ["pool.options=20", "setup.budget=1000000"]
+    given += ["pool.options=20", "setup.budget=1000000", "evaluation.humans=2"]
     with pytest.raises(InputError, match=f"setup.budget=1000000.*{what} would take"):
         settings.check_evaluate_settings(composed("evaluate", *given))
 

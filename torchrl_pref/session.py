@@ -217,7 +217,8 @@ class Session:
     @property
     def rationality(self) -> Tensor:
         """(B 3), what the person's tau is thought to be: the median, and what 5% of the samples are
-        below and above; the response model's own thrice where the belief does not infer it."""
+        below and above; the response model's own thrice where the belief does not infer it. An
+        InputError where the belief is of a human who never errs."""
         tau = self._env.belief.rationality(self._states[-1]["samples"])
         return self._plain(torch.quantile(tau, tau.new_tensor([0.5, 0.05, 0.95]), dim=1).mT)
 

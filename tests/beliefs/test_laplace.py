@@ -1,14 +1,18 @@
 """The Gaussian belief: its mode and curvature by autograd, and beside the samples."""
 
 import math
+from typing import Any
 
 import pytest
 import torch
 from torch import Generator, Tensor
 
+from torchrl_pref.beliefs import laplace
 from torchrl_pref.beliefs.base import BeliefBase
-from torchrl_pref.beliefs.laplace import LaplaceBelief, find_mode
+from torchrl_pref.beliefs.laplace import LaplaceBelief, find_mode, rows_there
 from torchrl_pref.beliefs.sampled import Belief, uniform_sphere
+from torchrl_pref.questions.base import Evidence
+from torchrl_pref.questions.prior_evidence import evidence_of, joined
 from torchrl_pref.questions.responses import Boltzmann
 from torchrl_pref.questions.weak import Weak
 
@@ -25,7 +29,9 @@ def test_newton_finds_the_mode(model: Boltzmann, n_options: int, generator: Gene
     answers = torch.randint(0, 2, (3, 8), generator=generator)
     answers[:, 2] = -1
     evidence = model.evidence(options, answers).double()
-    found = find_mode(evidence.rows.flatten(1, -2), evidence, model)
+    there = rows_there(evidence)
+    assert (there // evidence.offsets[0, 0].numel() != 2).all()
+    found = find_mode(evidence.rows.flatten(1, -2)[:, there], there, evidence, model)
     for s in range(3):
 
         def log_posterior(omega: Tensor, s: int = s) -> Tensor:
@@ -38,7 +44,7 @@ def test_newton_finds_the_mode(model: Boltzmann, n_options: int, generator: Gene
         assert slope.abs().max() < 1e-3
         if not model.lapse:
             hessian = torch.autograd.functional.hessian(log_posterior, omega.detach())
-            seen = found.roots[s].T @ evidence.rows[s].flatten(0, -2)
+            seen = found.roots[s].T @ evidence.rows[s].flatten(0, -2)[there]
             curvature = D * torch.eye(D).double() + seen.T @ seen
             assert torch.allclose(curvature, -hessian, atol=1e-8)
 
@@ -50,7 +56,7 @@ def test_samples_have_the_gaussian_s_moments(generator: Generator) -> None:
     answers = (options @ uniform_sphere((D,), generator)).argmax(-1)
     evidence = model.evidence(options, answers)
     rows = evidence.rows.flatten(1, -2).double()
-    found = find_mode(rows, evidence, model)
+    found = find_mode(rows, rows_there(evidence), evidence, model)
     seen = found.roots[0].T @ rows[0]
     covariance = torch.linalg.inv(D * torch.eye(D).double() + seen.T @ seen)
     length = math.sqrt(1 - float(covariance.trace()))
@@ -108,3 +114,74 @@ def test_hundreds_of_features(generator: Generator) -> None:
     samples, mean = after(belief, options, answers, at_once=True)
     assert torch.allclose(samples.norm(dim=-1), torch.ones(1), atol=1e-5)
     assert (torch.cosine_similarity(mean, omega) > 0.1).all()
+
+
+def test_padding_costs_nothing_and_changes_nothing(
+    generator: Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A demonstration against many others pads every answer; the curvature knows no padding."""
+    model, sessions = Boltzmann(4.5), 2
+    options = torch.randn(sessions, 5, 2, D, generator=generator)
+    answers = model.evidence(options, torch.zeros(sessions, 5, dtype=torch.long))
+    shown = torch.randn(sessions, 1, 40, D, generator=generator)
+    demonstrated = evidence_of({"rows": shown, "offsets": torch.zeros(sessions, 1, 40)})
+    both, sizes, found = joined(demonstrated, answers), [], []
+
+    def watched(rows: Tensor, *given: Any) -> laplace.Mode:
+        sizes.append(rows.shape[1])
+        found.append(find_mode(rows, *given))
+        return found[-1]
+
+    monkeypatch.setattr(laplace, "find_mode", watched)
+    belief = LaplaceBelief(model)
+    ess = torch.full((sessions,), 100.0)
+    belief.update(belief.prior(sessions, D, generator), ess, both, generator)
+    assert sizes == [40 + 5]
+    for s in range(sessions):
+        omega = found[0].mode[s].clone().requires_grad_()
+        gaps = both.rows[s].double() @ omega + both.offsets[s].double()
+        posterior = model.log_likelihood(gaps).sum() - D / 2 * omega.square().sum()
+        (slope,) = torch.autograd.grad(posterior, omega)
+        assert slope.abs().max() < 1e-3
+
+
+def test_a_row_that_is_there_in_one_session_is_kept_for_all() -> None:
+    offsets = torch.full((2, 2, 1, 3), torch.inf)
+    offsets[0, 0, 0, 1] = offsets[1, 1, 0, 2] = 0.0
+    evidence = Evidence(torch.zeros(2, 2, 1, 3, D), offsets, torch.zeros(2, 2))
+    assert rows_there(evidence).tolist() == [1, 5]
+
+
+def test_no_answers_leave_the_prior(generator: Generator) -> None:
+    belief, sessions = LaplaceBelief(Boltzmann(4.5)), 50
+    options = torch.randn(sessions, 3, 2, D, generator=generator)
+    nothing = belief.response_model.evidence(options, torch.full((sessions, 3), -1))
+    samples, ess = belief.prior(sessions, D, generator), torch.full((sessions,), 100.0)
+    samples = belief.update(samples, ess, nothing, generator).samples
+    assert samples.mean((0, 1)).abs().max() < 0.03
+    second = torch.einsum("smd,sme->de", samples, samples) / sessions / 100
+    assert torch.allclose(second, torch.eye(D) / D, atol=0.015)
+
+
+def test_sessions_are_updated_a_few_at_a_time(
+    generator: Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, sessions, sizes = Boltzmann(4.5), 7, []
+    options = torch.randn(sessions, 5, 2, D, generator=generator)
+    answers = (options @ torch.eye(D)[0]).argmax(-1)
+
+    def watched(rows: Tensor, *given: Any) -> laplace.Mode:
+        sizes.append(len(rows))
+        return find_mode(rows, *given)
+
+    monkeypatch.setattr(laplace, "find_mode", watched)
+    belief, ess = LaplaceBelief(model), torch.full((sessions,), 100.0)
+    samples = belief.prior(sessions, D, generator)
+    held = 3 * laplace.laplace_numbers(100, 5, D)
+    for bound in (held, 1):
+        monkeypatch.setattr(laplace, "LAPLACE_HELD", bound)
+        update = belief.update(samples, ess, model.evidence(options, answers), generator)
+        assert update.samples.shape == samples.shape
+        assert update.used.shape == update.ess.shape == (sessions,)
+        assert (update.samples.mean(1)[:, 0] > 0.1).all()
+    assert sizes == [3, 3, 1, *[1] * 7]

@@ -14,8 +14,9 @@ from torchrl_pref.beliefs.lapses import RATES, SHARES
 from torchrl_pref.beliefs.rationality import RationalityBelief
 from torchrl_pref.beliefs.sampled import uniform_sphere
 from torchrl_pref.beliefs.slice import ARC, MAX_SHRINKS, Target, compiled_moves, tensor_moves
+from torchrl_pref.envs.transition import begin, hear, tell
 from torchrl_pref.errors import InputError
-from torchrl_pref.questions.prior_evidence import demonstration, evidence_of, rows_of_shown
+from torchrl_pref.questions.prior_evidence import Given, evidence_of
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.questions.responses import Boltzmann, Optimal
 from torchrl_pref.session import Session
@@ -63,19 +64,28 @@ def test_calibration(model: Boltzmann, generator: Generator) -> None:
 
 
 def reference(
-    options: Tensor, answers: Tensor, model: Boltzmann, spread: float, draws: int = 400_000
+    options: Tensor,
+    answers: Tensor,
+    model: Boltzmann,
+    spread: float,
+    shown: Tensor | None = None,
+    draws: int = 400_000,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and variance of (ω, ln s) after answers (H), by importance sampling in NumPy."""
+    """Mean and variance of (ω, ln s) after answers (H), and what was shown (G J D), by importance
+    sampling in NumPy."""
     rng = np.random.default_rng(0)
     omega = rng.standard_normal((draws, options.shape[-1]))
     omega /= np.linalg.norm(omega, axis=1, keepdims=True)
     log_s = rng.normal(0, np.log(spread), draws)
     rate = model.lapse * rng.choice(RATES, draws, p=SHARES)
     log_weights = np.zeros(draws)
-    for shown, answer in zip(options.double().numpy(), answers.tolist(), strict=True):
-        lead = (shown[answer] - shown[1 - answer]) @ omega.T
+    for pair, answer in zip(options.double().numpy(), answers.tolist(), strict=True):
+        lead = (pair[answer] - pair[1 - answer]) @ omega.T
         sincere = np.exp(-np.logaddexp(0, -model.tau * np.exp(log_s) * lead))
         log_weights += np.log((1 - rate) * sincere + rate / 2 + 1e-300)
+    for rows in [] if shown is None else shown.double().numpy():
+        others = np.logaddexp.reduce(-model.tau * np.exp(log_s) * (rows @ omega.T))
+        log_weights -= np.logaddexp(0, others)  # no lapse: nobody shows at random
     weights = np.exp(log_weights - log_weights.max())
     weights /= weights.sum()
     assert 1 / np.square(weights).sum() > 3000
@@ -107,29 +117,47 @@ def test_samples_agree_with_importance_sampling(
     assert np.abs(np.square(values - mean).mean((0, 1)) / variance - 1).max() < 0.08
 
 
-@pytest.mark.parametrize("lapse", [0.0, 0.1])
-def test_what_was_shown_is_no_lapse(lapse: float, generator: Generator) -> None:
-    """Three demonstrations, each the best of 21 for the first feature, by importance sampling."""
-    model, belief = Boltzmann(2.0, lapse=lapse), RationalityBelief(Boltzmann(2.0, lapse=lapse))
-    others = torch.randn(3, 20, 3, generator=generator)
-    best = torch.tensor([2.5, 0.0, 0.0])
-    given = [demonstration(best, one) for one in others]
-    shown = evidence_of(rows_of_shown(given, 100, 3, model))
-    samples, ess = belief.prior(100, 3, generator), torch.full((100,), 100.0)
-    for g in range(1, 4):
-        samples, ess, _ = belief.update(samples, ess, shown[:, :g], generator)
-    rng = np.random.default_rng(0)
-    omega = rng.standard_normal((400_000, 3))
-    omega /= np.linalg.norm(omega, axis=1, keepdims=True)
-    log_s = rng.normal(0, np.log(3.0), len(omega))
-    returns = (best - others).double().numpy() @ omega.T  # (3 20 draws)
-    logits = np.clip(-2 * np.exp(log_s) * returns, -700, 700)
-    likely = -np.log1p(np.exp(logits).sum(1)).sum(0)
-    weights = np.exp(likely - likely.max())
-    values = np.concatenate([omega, log_s[:, None]], 1)
-    mean = weights @ values / weights.sum()
-    found = torch.cat([directions(samples), samples.norm(dim=-1, keepdim=True).log()], -1)
-    assert np.abs(found.double().mean((0, 1)).numpy() - mean).max() < 0.05
+@pytest.mark.parametrize("model", [Boltzmann(2.0), Boltzmann(2.0, lapse=0.2)], ids=str)
+def test_demonstrations_agree_with_importance_sampling(
+    model: Boltzmann, generator: Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What was shown is no lapse, and counts whatever the lapse rate is believed to be."""
+    options = torch.randn(4, 2, 3, generator=generator)
+    omega = uniform_sphere((3,), generator)
+    answers = (options @ omega).argmax(-1)
+    rows = torch.randn(3, 4, 3, generator=generator)
+    rows *= (rows @ omega).sum(-1, keepdim=True).sign().unsqueeze(-1)
+    mean, variance = reference(options, answers, model, 3.0, rows)
+    # Without moves, which would mend them, the samples must be right when they are reweighted.
+    monkeypatch.setattr(RationalityBelief, "_move", lambda self, samples, *_: samples)
+    sessions, belief = 20, RationalityBelief(model, samples=4000)
+    given: Given = {
+        "rows": rows.expand(sessions, -1, -1, -1),
+        "offsets": torch.zeros(sessions, 3, 4),
+    }
+    start = begin(belief.prior(sessions, 3, generator), 4, 2)
+    session = hear(belief, start, given, generator)
+    for shown, answer in zip(options, answers, strict=True):
+        asked = shown.expand(sessions, -1, -1), answer.expand(sessions)
+        session = tell(belief, session, *asked, torch.zeros(sessions).long(), generator)
+    samples = session["samples"]
+    log_s = samples.norm(dim=-1, keepdim=True).log()
+    values = torch.cat([directions(samples), log_s], -1).double().numpy()
+    sd = np.sqrt(variance)
+    error = values.mean(1).std(0) / math.sqrt(sessions) / sd
+    assert (np.abs(values.mean((0, 1)) - mean) / sd < 0.03 + 4 * error).all()
+    assert np.abs(np.square(values - mean).mean((0, 1)) / variance - 1).max() < 0.08
+
+
+@pytest.mark.parametrize("model", [Boltzmann(2.0), Boltzmann(2.0, lapse=0.2)], ids=str)
+def test_what_was_shown_weighs_as_if_nobody_lapsed(model: Boltzmann, generator: Generator) -> None:
+    belief = RationalityBelief(model)
+    samples = belief.prior(2, 3, generator)
+    rows = torch.randn(2, 1, 4, 3, generator=generator)
+    evidence = evidence_of({"rows": rows, "offsets": torch.zeros(2, 1, 4)})
+    likely = -np.log1p(np.exp(-2.0 * np.einsum("smd,sgjd->smj", samples, rows)).sum(-1))
+    found = belief._foreseen(samples, evidence).numpy()
+    assert np.allclose(found, likely, atol=1e-4)
 
 
 @pytest.mark.parametrize("model", [Boltzmann(3.0), Boltzmann(3.0, lapse=0.2)], ids=str)
@@ -206,3 +234,5 @@ def test_a_session_tells_how_careful_the_person_is(care: float, generator: Gener
     assert low < median < high < 4.0 * care * 6
     assert session.weights.mean.norm() <= 1
     assert torch.equal(Session(options, model).rationality, torch.full((3,), 4.0))
+    with pytest.raises(InputError, match="never errs"):
+        _ = Session(options, Optimal()).rationality

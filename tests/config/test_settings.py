@@ -11,19 +11,23 @@ from types import SimpleNamespace
 from typing import Any, get_type_hints, is_typeddict
 
 import pytest
+import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 import torchrl_pref
 from benchmarks.bad_settings import FAULTS, every_command, run_forked
+from torchrl_pref.beliefs import lapses
 from torchrl_pref.beliefs import sampled as belief
 from torchrl_pref.beliefs import slice as sampler
 from torchrl_pref.checkpoints import contents
-from torchrl_pref.config import checks, memory, sections, settings
+from torchrl_pref.config import checks, memory, sections, settings, together
 from torchrl_pref.envs import objectives
 from torchrl_pref.errors import InputError, one_line
 from torchrl_pref.policies import attention
 from torchrl_pref.questions import QUESTIONS
+from torchrl_pref.questions.prior_evidence import evidence_of, joined
+from torchrl_pref.questions.responses import Boltzmann
 from torchrl_pref.training.algorithms import ALGORITHMS
 from torchrl_pref.training.loggers import LOGGERS
 
@@ -80,21 +84,6 @@ def test_the_types_of_the_sections_name_the_keys_of_conf_and_their_values(
         assert ours <= value.keys(), key
         for name, number in value.items():
             assert isinstance(number, inner[name]), (key, name)
-
-
-@pytest.mark.parametrize(
-    ("typed", "message"),
-    [
-        (("belief=rationality", "tau=optimal"), "belief=rationality with tau=optimal"),
-        (("belief=laplace", "tau=[noisy,optimal]"), "belief=laplace with tau=optimal"),
-        (("belief=rationality", "tau=2", "belief.lapse=0.25"), "expected less than 0.25"),
-    ],
-)
-def test_what_a_belief_cannot_infer_is_refused_before_anything_runs(
-    typed: tuple[str, ...], message: str
-) -> None:
-    with pytest.raises(InputError, match=message):
-        settings.check_evaluate_settings(composed("evaluate", *typed))
 
 
 def test_moves_may_be_left_to_the_belief() -> None:
@@ -229,6 +218,70 @@ def test_the_package_gives_its_names_when_they_are_used() -> None:
         _ = torchrl_pref.Nothing
 
 
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["belief=rationality"], r"belief=rationality with tau=\[noisy,optimal\].*type tau=noisy"),
+        (["belief=laplace", "tau=optimal"], "belief=laplace with tau=optimal.*type tau=noisy"),
+        (
+            ["belief=rationality", "tau=noisy", "belief.lapse=0.25"],
+            "belief.lapse=0.25 with belief=rationality.*less than 0.25",
+        ),
+    ],
+)
+def test_what_a_belief_cannot_infer_is_refused_before_the_first_panel(
+    overrides: list[str], message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        settings.check_evaluate_settings(composed("evaluate", *overrides))
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["belief=rationality", "tau=noisy", "belief.lapse=0.24"],
+        ["belief=laplace", "tau=[noisy,3]", "belief.lapse=0.3", "human.tau=optimal"],
+    ],
+)
+def test_what_a_belief_can_infer_is_let_through(overrides: list[str]) -> None:
+    settings.check_evaluate_settings(composed("evaluate", *overrides))
+
+
+def test_the_largest_rate_is_that_of_the_belief() -> None:
+    assert lapses.RATES[-1] == together.LARGEST_RATE
+
+
+def part(what: str, *overrides: str) -> float:
+    """Bytes that a part of an evaluation is estimated at."""
+    parts = memory.parts_of(composed("evaluate", *overrides))  # type: ignore[arg-type]
+    return {part.what: part.size for part in parts}[what]
+
+
+def test_the_estimate_pads_answers_and_demonstrations_as_the_session_does() -> None:
+    """An evidence of them has all factors and rows of the largest."""
+    options, kind = torch.randn(1, 20, 4, 4), QUESTIONS["ranking"]()
+    answers = Boltzmann(1.0, kind).evidence(options, torch.zeros(1, 20, dtype=torch.long))
+    shown = evidence_of({"rows": torch.zeros(1, 3, 50, 4), "offsets": torch.zeros(1, 3, 50)})
+    padded = joined(shown, answers).offsets.numel()
+    given = ["question=ranking", "pool.options=4", "setup.budget=20", "evaluation.humans=1000"]
+    demonstrations = ["demonstrations.count=3", "demonstrations.alternatives=50"]
+    at_once = min(1000 * 100, memory.MOVED // memory.default_moves(4))
+    size, more = (
+        part("the likelihood of the answers", *given, *extra) for extra in ([], demonstrations)
+    )
+    assert more - size == 8.0 * (padded - answers.offsets.numel()) * at_once
+
+
+def test_the_estimate_knows_the_gaussian_belief() -> None:
+    what, given = "the Gaussian of belief=laplace", ["belief=laplace", "tau=noisy"]
+    small = part(what, *given, "setup.budget=30", "evaluation.humans=1000")
+    assert small == 8.0 * memory.LAPLACE_COPIES * memory.LAPLACE_HELD
+    assert part(what, *given, "setup.budget=9000") > 8.0 * 9000**2
+    given += ["pool.options=20", "setup.budget=1000000", "evaluation.humans=2"]
+    with pytest.raises(InputError, match=f"setup.budget=1000000.*{what} would take"):
+        settings.check_evaluate_settings(composed("evaluate", *given))
+
+
 def test_the_estimate_knows_what_the_belief_does_at_once() -> None:
     """The estimate is made before anything heavy is imported, so the numbers stand there again."""
     assert memory.MOVED == belief.MOVED
@@ -239,5 +292,5 @@ def test_the_estimate_knows_how_many_answers_there_are() -> None:
     for name, kind in QUESTIONS.items():
         for n_options in {"weak": (2,), "approve": (1,)}.get(name, (2, 3, 5)):
             table = kind().answers(n_options)
-            expected = len(table.labels), table.offsets[0].numel()
+            expected = len(table.labels), *table.offsets.shape[1:]
             assert memory.sizes_of({"question": {"name": name}}, n_options) == expected

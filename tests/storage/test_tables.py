@@ -188,7 +188,7 @@ BAD: dict[str, tuple[str, Callable[[], bytes | str], str]] = {
     "csv: a zip": (".csv", lambda: npz(**BY_NAME), "cannot be read|letters|column|cells|UTF-8"),
     "csv: zeros": (".csv", lambda: bytes(2**22), "cannot be read|letters"),
     "csv: one line": (".csv", lambda: "1," * 2**21, "a line of more than"),
-    "csv: many columns": (".csv", lambda: ",".join(map(str, range(MAX_COLUMNS + 1))), "columns"),
+    "csv: many columns": (".csv", lambda: ",".join(map(str, range(MAX_COLUMNS + 1))), "no names"),
     "csv: open quote": (".csv", lambda: 'a,b\n1,"2\n' + "1,2\n" * 10**5, "cannot be read"),
     "npz: cut off": (".npz", lambda: npz(**BY_NAME)[:-40], "cannot be read"),
     "npz: text": (".npz", lambda: csv_text(), "cannot be read"),
@@ -209,7 +209,7 @@ BAD: dict[str, tuple[str, Callable[[], bytes | str], str]] = {
     "npz: other lengths": (".npz", lambda: npz(a=X[:, 0], b=X[:7, 0]), "shape"),
     "npz: four dimensions": (".npz", lambda: npz(features=X[None, None]), "expected .N traj"),
     "npz: a scalar": (".npz", lambda: npz(a=1.0, b=2.0), "shape"),
-    "npz: no rows": (".npz", lambda: npz(features=X[:0]), "shape"),
+    "npz: no rows": (".npz", lambda: npz(features=X[:0]), "no trajectories"),
     "npz: names too few": (
         ".npz",
         lambda: npz(features=X, feature_names=np.array(NAMES[:2])),

@@ -10,8 +10,10 @@ from typing import NamedTuple
 
 from torch import Generator, Tensor
 
+from torchrl_pref.errors import InputError
 from torchrl_pref.questions.base import Evidence
 from torchrl_pref.questions.response_model import ResponseModel
+from torchrl_pref.questions.responses import Optimal
 from torchrl_pref.tensors import lengths
 
 
@@ -47,7 +49,16 @@ class BeliefBase(ABC):
         return f"{type(self).__name__}({', '.join(numbers)})"
 
     def rationality(self, samples: Tensor) -> Tensor:
-        """What samples (S M D) hold tau to be, (S M): their lengths times the model's scale."""
+        """What samples (S M D) hold tau to be, (S M): their lengths times the model's scale.
+
+        Raises:
+            InputError: the response model is that of a human who never errs.
+        """
+        if isinstance(self.response_model, Optimal):
+            raise InputError(
+                f"tau of {self.response_model!r}: a human who never errs has none; expected a "
+                "belief in Boltzmann(tau); make the session with that, or do not ask for it"
+            )
         return lengths(samples).squeeze(-1) * self.response_model.scale
 
     @abstractmethod

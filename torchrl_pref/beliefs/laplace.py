@@ -1,7 +1,7 @@
 """A Gaussian approximation of the belief, for hundreds of features.
 
 Shapes: S sessions, M samples, H answers, F factors of an answer, J rows of a factor, D features, G
-rows of all answers (H F J).
+rows of all answers: of the H F J those that are there in some session.
 
 The uniform prior of the sphere is taken to be a Gaussian with covariance I/D, whose draws are of
 length 1 but for a deviation of 1/√2D. The posterior is taken to be a Gaussian about its mode, with
@@ -26,6 +26,7 @@ from torch.nn import functional as F
 
 from torchrl_pref.beliefs.base import BeliefBase, Update
 from torchrl_pref.beliefs.sampled import uniform_sphere
+from torchrl_pref.config.memory import LAPLACE_HELD, laplace_numbers
 from torchrl_pref.errors import InputError, check_count, check_type
 from torchrl_pref.questions.base import Evidence
 from torchrl_pref.questions.response_model import ResponseModel
@@ -75,9 +76,22 @@ class LaplaceBelief(BeliefBase):
     ) -> Update:
         """See :meth:`BeliefBase.update`."""
         check_finite("samples or features of the answers", samples, answers.rows)
+        there = rows_there(answers)
+        size = LAPLACE_HELD // laplace_numbers(self.n_samples, len(there), samples.shape[-1])
+        updates = []
+        for some in torch.arange(len(samples), device=samples.device).split(max(1, size)):
+            given = samples[some], ess[some], answers[some]
+            updates.append(self._update(*given, there, generator))
+        return Update(*(torch.cat(field) for field in zip(*updates, strict=True)))
+
+    def _update(
+        self, samples: Tensor, ess: Tensor, answers: Evidence, there: Tensor, generator: Generator
+    ) -> Update:
+        """:meth:`update` for as many sessions as are held in memory at once, by the rows that
+        :func:`rows_there` finds."""
         size, n_features = len(samples), samples.shape[-1]
-        rows = answers.rows.flatten(1, -2).double()
-        found = find_mode(rows, answers, self.response_model)
+        rows = answers.rows.flatten(1, -2)[:, there].double()
+        found = find_mode(rows, there, answers, self.response_model)
         shape = (size, self.n_samples, n_features)
         draws = torch.randn(shape, generator=generator, device=samples.device).to(rows)
         shape = (size, self.n_samples, rows.shape[1])
@@ -107,11 +121,18 @@ class Mode(NamedTuple):
     """(S G G), whose product with their own transpose is the curvature in the rows' returns."""
 
 
-def find_mode(rows: Tensor, answers: Evidence, model: Boltzmann) -> Mode:
+def rows_there(answers: Evidence) -> Tensor:
+    """(G), which of the H F J rows of answers (S H) are there in some session: the others pad
+    answers of fewer factors or rows, and would cost as much as any."""
+    return answers.offsets.flatten(1).isfinite().any(0).nonzero().squeeze(-1)
+
+
+def find_mode(rows: Tensor, there: Tensor, answers: Evidence, model: Boltzmann) -> Mode:
     """The mode of the posterior under the Gaussian prior, by Newton's method.
 
     Args:
-        rows: (S G D) float64, those of the answers.
+        rows: (S G D) float64, those of the answers that are there.
+        there: (G), see :func:`rows_there`.
         answers: (S H).
         model: the likelihood.
     """
@@ -119,35 +140,45 @@ def find_mode(rows: Tensor, answers: Evidence, model: Boltzmann) -> Mode:
     eye = torch.eye(rows.shape[1]).to(rows)
     weights = rows.new_zeros(rows.shape[:2])  # the mode is their sum of the rows, over D
     shares = rows.new_tensor(SHARES)[:, None, None]
-    best = _height(kernel, weights, answers, model)
+    best = _height(kernel, weights, there, answers, model)
     for _ in range(STEPS):
         returns = (kernel @ weights.unsqueeze(-1)).squeeze(-1)
-        slope, roots = curvature(returns, answers, model)
+        slope, roots = curvature(returns, there, answers, model)
         aim = (roots @ (roots.mT @ returns.unsqueeze(-1))).squeeze(-1) + slope
         inner = roots.mT @ kernel @ roots + eye
         pull = roots.mT @ (kernel @ aim.unsqueeze(-1))
         pull = roots @ torch.cholesky_solve(pull, torch.linalg.cholesky(inner))
         tried = weights + shares * (aim - pull.squeeze(-1) - weights)
-        heights = torch.stack([_height(kernel, each, answers, model) for each in tried])
+        heights = torch.stack([_height(kernel, each, there, answers, model) for each in tried])
         highest, which = heights.max(0)
         weights = tried[which, torch.arange(len(weights), device=weights.device)]
         if ((highest - best) <= GAIN * best.abs().clamp(min=1)).all():
             break
         best = highest
-    _, roots = curvature((kernel @ weights.unsqueeze(-1)).squeeze(-1), answers, model)
+    _, roots = curvature((kernel @ weights.unsqueeze(-1)).squeeze(-1), there, answers, model)
     mode = (weights.unsqueeze(1) @ rows).squeeze(1) / rows.shape[-1]
     return Mode(mode, roots)
 
 
-def _height(kernel: Tensor, weights: Tensor, answers: Evidence, model: Boltzmann) -> Tensor:
+def _gaps(returns: Tensor, there: Tensor, answers: Evidence) -> Tensor:
+    """(S H F J), of answers whose rows have returns (S G)."""
+    offsets = answers.offsets.flatten(1).to(returns)
+    return offsets.index_add(1, there, returns).view(answers.offsets.shape)
+
+
+def _height(
+    kernel: Tensor, weights: Tensor, there: Tensor, answers: Evidence, model: Boltzmann
+) -> Tensor:
     """(S), the log-posterior at weights (S G)."""
     returns = (kernel @ weights.unsqueeze(-1)).squeeze(-1)
-    gaps = returns.view(answers.offsets.shape) + answers.offsets
+    gaps = _gaps(returns, there, answers)
     likelihood = model.answer_log_likelihood(gaps, answers.floor.to(gaps)).sum(-1)
     return likelihood - (weights * returns).sum(-1) / 2
 
 
-def curvature(returns: Tensor, answers: Evidence, model: Boltzmann) -> tuple[Tensor, Tensor]:
+def curvature(
+    returns: Tensor, there: Tensor, answers: Evidence, model: Boltzmann
+) -> tuple[Tensor, Tensor]:
     """How the log-likelihood changes with the rows' returns (S G).
 
     Where answers may be lapses it is not concave; of its curvature the part that always is one is
@@ -156,7 +187,7 @@ def curvature(returns: Tensor, answers: Evidence, model: Boltzmann) -> tuple[Ten
     Returns:
         Slope (S G), and a root (S G G) of the negative curvature.
     """
-    gaps = returns.view(answers.offsets.shape) + answers.offsets
+    gaps = _gaps(returns, there, answers)
     # Of the preferred and of each other: what a softmax gives them.
     shares = F.softmax(F.pad(-model.tau * gaps, (1, 0)), -1)
     first, others = shares[..., :1], shares[..., 1:]
@@ -172,10 +203,9 @@ def curvature(returns: Tensor, answers: Evidence, model: Boltzmann) -> tuple[Ten
         -2
     )
     blocks = model.tau * sincere.sqrt().unsqueeze(-1) * blocks
-    n_rows = gaps.shape[-1]
-    blocks = blocks.flatten(1, 2)
-    size = blocks.shape[1]
-    roots = blocks.new_zeros(len(blocks), size, n_rows, size, n_rows)
-    every = torch.arange(size, device=blocks.device)
-    roots[:, every, :, every, :] = blocks.transpose(0, 1)
-    return slope.flatten(1), roots.flatten(3, 4).flatten(1, 2)
+    # Rows of different factors have nothing to do with each other.
+    factor, place = there // gaps.shape[-1], there % gaps.shape[-1]
+    row, column = (factor.unsqueeze(1) == factor).nonzero().unbind(1)
+    roots = blocks.new_zeros(len(blocks), len(there), len(there))
+    roots[:, row, column] = blocks.flatten(1, 2)[:, factor[row], place[row], place[column]]
+    return slope.flatten(1)[:, there], roots

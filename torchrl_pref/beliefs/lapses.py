@@ -93,6 +93,6 @@ class LapseRates:
         product = self.model.log_likelihood(gaps).sum(-1).unsqueeze(-1)
         floor = answers.floor[:, None, :, None] * self.odds.to(gaps)
         likely = torch.logaddexp(product, floor.log()) + (1 - self.rates.to(gaps)).log()
-        # What people showed has no floor, as it is never shown at random; and what is no answer has
-        # neither a floor nor a factor.
-        return torch.where((answers.floor > 0)[:, None, :, None], likely, product)
+        # What was shown is no lapse, and has no floor; what is no answer has none and a product of
+        # 1. Neither says anything of how often people lapse.
+        return torch.where(answers.floor[:, None, :, None] > 0, likely, product)

@@ -26,21 +26,33 @@ HELD_OUT = 2000
 MOVED = 2**20
 """Moves of samples that a belief makes at once, see ``beliefs.sampled``."""
 
+LAPLACE_HELD = 2**22
+"""Numbers of the matrices that ``beliefs.laplace`` makes at once, see :func:`laplace_numbers`."""
+
+LAPLACE_COPIES = 6
+"""How many matrices of each size it holds at its peak."""
+
 UNIFORMS = 18
 """Random numbers of a move, see ``beliefs.slice.MAX_SHRINKS``."""
+
+SHOWN = ("demonstrations.count", "demonstrations.alternatives")
 
 LIMIT_FILES = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 """Where Linux writes what a container may use."""
 
 
-SIZES: dict[str, Callable[[int], tuple[int, int]]] = {
-    "weak": lambda n_options: (3, 2),
-    "ranking": lambda n_options: (math.factorial(min(n_options, 6)), (n_options - 1) ** 2),
-    "best_worst": lambda n_options: (n_options * (n_options - 1), 2 * (n_options - 1)),
-    "approve": lambda n_options: (2, 1),
+SIZES: dict[str, Callable[[int], tuple[int, int, int]]] = {
+    "weak": lambda n_options: (3, 2, 1),
+    "ranking": lambda n_options: (
+        math.factorial(min(n_options, 6)),
+        n_options - 1,
+        n_options - 1,
+    ),
+    "best_worst": lambda n_options: (n_options * (n_options - 1), 2, n_options - 1),
+    "approve": lambda n_options: (2, 1, 1),
 }
-"""From K to the number of answers R and the rows of each, by kind of question; of the others they
-are those of a choice, K and K-1."""
+"""From K to the number of answers R, the factors F of each and the rows J of a factor, by kind of
+question; of the others they are those of a choice, K, 1 and K-1."""
 
 
 class Part(NamedTuple):
@@ -91,7 +103,7 @@ def parts_of(settings: Settings, *pool_shape: int) -> Iterator[Part]:
         steps = settings["training"]["steps"] or offers or budget
         frames = settings["training"]["sessions"] * steps
         kept = 36.0 * samples * n_features
-        n_answers, _ = sizes_of(settings, n_options)
+        n_answers, _, _ = sizes_of(settings, n_options)
         kept += 5.0 * (budget * (16 + 4 * n_answers) + 8 * offers + 100)
         kept += 20.0 * _rows_shown(settings) * (n_features + 1)
         kept += _shown(settings, n_queries, n_options, n_features)
@@ -108,10 +120,10 @@ def parts_of(settings: Settings, *pool_shape: int) -> Iterator[Part]:
     yield from _belief_parts(settings, n_options, n_features)
 
 
-def sizes_of(settings: Settings, n_options: int) -> tuple[int, int]:
-    """How many answers there are, and how many rows each has."""
+def sizes_of(settings: Settings, n_options: int) -> tuple[int, int, int]:
+    """How many answers there are, how many factors each has, and how many rows a factor."""
     size = SIZES.get(settings["question"]["name"])
-    return (n_options, n_options - 1) if size is None else size(n_options)
+    return (n_options, 1, n_options - 1) if size is None else size(n_options)
 
 
 def _shown(settings: Settings, n_queries: int, n_options: int, n_features: int) -> float:
@@ -135,21 +147,32 @@ def default_moves(n_features: int) -> int:
     return max(4, n_features, n_features**2 // 8, n_features**3 // 128)
 
 
+def laplace_numbers(samples: int, n_rows: int, n_features: int) -> int:
+    """Numbers of the matrices of a session that ``beliefs.laplace`` makes, of G rows: G times G and
+    G times D, and M times each."""
+    return (n_rows + samples) * (n_rows + n_features)
+
+
 def _belief_parts(settings: Settings, n_options: int, n_features: int) -> Iterator[Part]:
     """What an update of the belief holds at once, for sessions in groups of so many samples."""
-    belief, budget = settings["belief"], settings["setup"]["budget"]
-    sessions = settings.get("training", {}).get("sessions", 0)
+    belief, sessions = settings["belief"], settings.get("training", {}).get("sessions", 0)
     sessions = max(sessions, settings["evaluation"]["humans"])
     samples = belief.get("samples", 100)
-    moves = belief.get("moves") or default_moves(n_features)
-    at_once = max(samples, min(sessions * samples, MOVED // moves))
-    directions = 4.0 * (UNIFORMS * moves + 4 * n_features) * at_once
-    yield Part("moving the belief", directions, ("belief.samples", "belief.moves"))
-    n_answers, n_rows = sizes_of(settings, n_options)
-    answers = 8.0 * (budget * n_rows + _rows_shown(settings)) * at_once
-    answers += 8.0 * n_options * n_answers * samples
-    keys = ("belief.samples", "setup.budget", "pool.options", "demonstrations.count")
-    yield Part("the likelihood of the answers", answers, keys)
+    keys = ("belief.samples", "setup.budget", "pool.options", *SHOWN)
+    n_answers, n_factors, n_rows = sizes_of(settings, n_options)
+    if belief["name"] == "laplace":
+        there = settings["setup"]["budget"] * n_factors * n_rows + _rows_shown(settings)
+        each = laplace_numbers(samples, there, n_features)
+        held = max(each, min(sessions * each, LAPLACE_HELD))
+        yield Part("the Gaussian of belief=laplace", 8.0 * LAPLACE_COPIES * held, keys)
+    else:
+        moves = belief.get("moves") or default_moves(n_features)
+        at_once = max(samples, min(sessions * samples, MOVED // moves))
+        directions = 4.0 * (UNIFORMS * moves + 4 * n_features) * at_once
+        yield Part("moving the belief", directions, ("belief.samples", "belief.moves"))
+        answers = 8.0 * _padded_rows(settings, n_factors, n_rows) * at_once
+        answers += 8.0 * n_options * n_answers * samples
+        yield Part("the likelihood of the answers", answers, keys)
     if settings["objective"] == "entropy":
         distances = 8.0 * sessions * samples**2
         yield Part("objective=entropy", distances, ("belief.samples", "evaluation.humans"))
@@ -159,6 +182,15 @@ def _rows_shown(settings: Settings) -> int:
     """What a session's demonstrations were preferred to, taken together."""
     shown = settings["demonstrations"]
     return int(shown["count"] * shown["alternatives"])
+
+
+def _padded_rows(settings: Settings, n_factors: int, n_rows: int) -> int:
+    """Rows of a session's answers and demonstrations, all padded to the largest of them, as
+    ``questions.prior_evidence.joined`` does."""
+    shown = settings["demonstrations"]
+    if shown["count"]:
+        n_rows = max(n_rows, shown["alternatives"])
+    return int((settings["setup"]["budget"] + shown["count"]) * n_factors * n_rows)
 
 
 def _offers(settings: Settings) -> int:

@@ -143,7 +143,6 @@ OTHERS: dict[str, dict[str, dict[str, Check]]] = {
 }
 """Of the other groups. What is not in here is checked by what is made of it: ``open_groups``."""
 
-
 PRETRAINED: dict[str, dict[str, Check]] = {"pretrained": {}}
 """The policies that evaluate.py can be asked for by name."""
 

@@ -1,6 +1,8 @@
-"""What settings may not be together, though each is right alone."""
+"""Values of settings that are right one by one and wrong together."""
 
 from __future__ import annotations
+
+from typing import Any
 
 from torchrl_pref.config.sections import Plain
 from torchrl_pref.errors import InputError, check_count
@@ -8,16 +10,19 @@ from torchrl_pref.errors import InputError, check_count
 OF_ONE = ("approve", "own")
 """Kinds of question that may be about one option."""
 
+LARGEST_RATE = 4.0
+"""Of the lapse rates that are thought possible, in units of their mean, see ``beliefs.lapses``."""
+
 
 def check_together(settings: Plain) -> None:
     """Refuse values that are right one by one and wrong together.
 
     Raises:
-        InputError: there are some.
+        InputError: some are.
     """
     pool, setup, belief = settings["pool"], settings["setup"], settings["belief"]
     _check_demonstrations(settings)
-    _check_inferring(settings)
+    _check_belief(settings)
     given = [name for name in ("train", "test") if pool[name] is not None]
     if len(given) == 1 and settings.get("checkpoint") is None:
         raise InputError(
@@ -44,21 +49,6 @@ def check_together(settings: Plain) -> None:
         )
 
 
-def _check_inferring(settings: Plain) -> None:
-    """Refuse beliefs that have no use for what is assumed of the human."""
-    name, lapse = settings["belief"]["name"], settings["belief"]["lapse"]
-    taus = settings["tau"] if isinstance(settings["tau"], list) else [settings["tau"]]
-    if name in ("rationality", "laplace") and "optimal" in taus:
-        raise InputError(
-            f"belief={name} with tau=optimal: it is for people who err; set tau=noisy or a number"
-        )
-    if name == "rationality" and lapse >= 0.25:
-        raise InputError(
-            f"belief.lapse={lapse} with belief=rationality: expected less than 0.25, as some "
-            "people are taken to have four times that; lower it"
-        )
-
-
 def _check_demonstrations(settings: Plain) -> None:
     """Refuse demonstrations that the pool has not enough trajectories for, or the belief no tau."""
     shown, pool = settings["demonstrations"], settings["pool"]
@@ -70,9 +60,35 @@ def _check_demonstrations(settings: Plain) -> None:
             f"demonstrations.alternatives={shown['alternatives']} with {walks} trajectories in the "
             "pool: expected fewer; lower it, or raise pool.size"
         )
-    taus = settings["tau"] if isinstance(settings["tau"], list) else [settings["tau"]]
-    if shown["tau"] is not None and "optimal" in taus:
+    if shown["tau"] is not None and "optimal" in _taus(settings):
         raise InputError(
             f"demonstrations.tau={shown['tau']} with tau=optimal: to a belief in a human who never "
             "errs nothing is shown less carefully; leave demonstrations.tau out, or set tau=noisy"
         )
+
+
+def _check_belief(settings: Plain) -> None:
+    """Refuse a human whom the belief cannot infer."""
+    belief = settings["belief"]
+    name = belief["name"]
+    if name in ("rationality", "laplace") and "optimal" in _taus(settings):
+        raise InputError(
+            f"belief={name} with tau={_typed(settings['tau'])}: it can infer nothing of humans who "
+            "never err; type tau=noisy, or belief=sampled"
+        )
+    if name == "rationality" and belief["lapse"] * LARGEST_RATE >= 1:
+        raise InputError(
+            f"belief.lapse={belief['lapse']} with belief=rationality: some people are taken to "
+            f"lapse {LARGEST_RATE:g} times as often; expected less than {1 / LARGEST_RATE:g}; "
+            "lower it, or type belief=sampled"
+        )
+
+
+def _taus(settings: Plain) -> list[Any]:
+    """The kinds of human, one or several."""
+    return settings["tau"] if isinstance(settings["tau"], list) else [settings["tau"]]
+
+
+def _typed(value: Any) -> str:
+    """A value, or a list of them, as it is typed."""
+    return f"[{','.join(map(str, value))}]" if isinstance(value, list) else str(value)

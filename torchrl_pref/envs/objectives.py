@@ -118,7 +118,8 @@ class Entropy(Objective):
 
     By the distance of each sample to its third nearest (Kozachenko and Leonenko, 1987), which needs
     no shape of the belief: on the sphere, D-1 bits for every halving of the distances. Its expected
-    loss is the information gain.
+    loss is the information gain, where the belief infers ω alone: the gain of one that infers tau
+    too (``belief=rationality``) counts what is learned of tau, and the entropy here does not.
     """
 
     def potential(self, session: SessionState, human: Mapping[str, Any]) -> Tensor:

@@ -17,6 +17,8 @@ sys.path[0] = str(Path(__file__).resolve().parents[1])  # this folder's select.p
 from itertools import product
 
 import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from torch import Generator, Tensor
 
 from benchmarks import common
@@ -33,7 +35,7 @@ from torchrl_pref.strategies import Greedy
 from torchrl_pref.tensors import directions
 
 FACTORS = (1 / 8, 1 / 4, 1 / 2, 1.0, 2.0, 4.0, 8.0)
-LEVELS = (0.5, 0.8, 0.9, 0.95)
+LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
 BUDGET = 20
 TRAJECTORIES = 20
 """Random ones whose returns are looked at, for each human."""
@@ -46,6 +48,7 @@ def main() -> None:
     parser.add_argument("--queries", type=int, default=500, help="of a pool (default 500)")
     parser.add_argument("--seed", type=int, default=0, help="of the humans (default 0)")
     parser.add_argument("--lapse", type=float, default=0.0, help="that beliefs expect (default 0)")
+    parser.add_argument("--plot", type=Path, help="also draw the coverage into this file")
     options = common.start(parser)
     pools = {"Gridworld": gridworld(options.queries), "isotropic": isotropic(options.queries)}
     cosines: list[common.Row] = []
@@ -67,11 +70,13 @@ def main() -> None:
             cosines.append(row)
         for kind, each in inside.items():
             shares = torch.stack(each).mean(0).tolist()
-            levels = {f"{level:.0%}": share for level, share in zip(LEVELS, shares, strict=True)}
+            levels = dict(zip(map("{:.0%}".format, LEVELS), shares, strict=True))
             covered.append({"pool": name, "greedy by": how, "belief": kind, **levels})
     title = f"Cosine of the mean after {BUDGET} answers, {options.humans} humans a row"
     common.report(title, cosines, options.json)
     common.report("Coverage of central intervals", covered, None)
+    if options.plot:
+        draw(covered, options.plot)
 
 
 def gridworld(n_queries: int) -> QueryPool:
@@ -122,6 +127,33 @@ def coverage(samples: Tensor, omega: Tensor) -> Tensor:
         inside.append(((low < true) & (true < high)).double().mean())
     return torch.stack(inside)
 
+
+def draw(covered: list[common.Row], path: Path) -> None:
+    """How often intervals hold what they should, a panel for each pool and way to ask."""
+    asked_by = list(dict.fromkeys((row["pool"], row["greedy by"]) for row in covered))
+    figure = Figure(figsize=(3.1 * len(asked_by), 3.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(1, len(asked_by), sharex=True, sharey=True)
+    for axes, (pool, how) in zip(panels, asked_by, strict=True):
+        axes.plot((0, 1), (0, 1), color="#bbbbbb", lw=1)
+        for row in covered:
+            if (row["pool"], row["greedy by"]) == (pool, how):
+                shares = [row[f"{level:.0%}"] for level in LEVELS]
+                color, line = STYLES[row["belief"]]
+                axes.plot(LEVELS, shares, color=color, linestyle=line, label=row["belief"])
+        axes.set(title=f"{pool}\ngreedy by {how.replace('_', ' ')}", aspect="equal")
+        axes.set(xlabel="interval of", xlim=(0, 1), ylim=(0, 1))
+        axes.grid(alpha=0.25)
+    panels[0].set_ylabel("holds")
+    panels[0].legend(frameon=False, fontsize="small", loc="upper left")
+    figure.savefig(path, dpi=130)
+
+
+STYLES = {
+    "inferred": ("#0072b2", "-"),
+    "told wrongly": ("#d55e00", "--"),
+    "told rightly": ("#1f1f1f", ":"),
+}
 
 if __name__ == "__main__":
     main()

@@ -1,3 +1,10 @@
+import os
+
+# Before NumPy and torch are there, which read it once: threads of several test processes that wait
+# for each other on the same cores take three times as long.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import pytest
 import torch
 from torch import Generator

@@ -89,7 +89,7 @@ def test_no_answer_says_nothing(model: ResponseModel, n_options: int, generator:
 
 def quadrature() -> Tensor:
     """Points (G 3), spread evenly over the sphere, in float64."""
-    place = torch.arange(200_000, dtype=torch.float64) + 0.5
+    place = torch.arange(40_000, dtype=torch.float64) + 0.5
     height, turn = 1 - 2 * place / len(place), place * math.pi * (1 + math.sqrt(5))
     radius = (1 - height.square()).sqrt()
     return torch.stack([radius * turn.cos(), radius * turn.sin(), height], -1)
@@ -113,7 +113,7 @@ def test_the_posterior_is_that_of_the_probabilities(
     )
     mean = weights @ points
     covariance = (points * weights[:, None]).T @ points - torch.outer(mean, mean)
-    sessions, belief = 40 if in_tensors else 400, Belief(model)
+    sessions, belief = 40 if in_tensors else 200, Belief(model)
     samples, ess = belief.prior(sessions, 3, generator), torch.full((sessions,), 100.0)
     for h in range(1, len(queries) + 1):
         evidence = model.evidence(queries[:h], answers[:h]).expand(sessions, h)

@@ -120,7 +120,7 @@ def test_kills_and_double_starts(tmp_path: Path) -> None:
     """A few of ``benchmarks/kills.py``, which says so where anything is lost or mixed."""
     script = [sys.executable, str(ROOT / "benchmarks" / "kills.py")]
     done = subprocess.run(
-        [*script, "--kills=2", "--starts=2", "--seed=1"],
+        [*script, "--kills=2", "--starts=3", "--seed=1"],
         env={**os.environ, "OMP_NUM_THREADS": "1", "TMPDIR": str(tmp_path)},
         capture_output=True,
         text=True,

@@ -6,10 +6,9 @@ that help and refusals come at once.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import hydra
 from omegaconf import DictConfig, OmegaConf
@@ -19,7 +18,7 @@ import typed
 from torchrl_pref import runs, sweeps
 from torchrl_pref.checkpoints.migrations import migrate
 from torchrl_pref.config.memory import check_memory
-from torchrl_pref.config.sections import Plain, Settings
+from torchrl_pref.config.sections import Plain, Settings, flat
 from torchrl_pref.config.settings import check_run, check_train_settings
 from torchrl_pref.errors import InputError
 from torchrl_pref.runs import CHECKPOINT
@@ -129,16 +128,6 @@ def refuse_other_run(folder: Path, settings: Settings) -> None:
             f"{folder} holds a run with other settings ({', '.join(differing)}); name another "
             "folder by hydra.sweep.dir=, or type the settings of that sweep"
         )
-
-
-def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings by their dotted keys."""
-    found: dict[str, Any] = {}
-    for key, value in settings.items():
-        found |= (
-            flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
-        )
-    return found
 
 
 def load_config(folder: Path) -> Plain:

@@ -20,13 +20,16 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from torchrl_pref.config.sections import Plain
+from help_text import CONF, keys_of
+from torchrl_pref.config.sections import CODE, Plain
 from torchrl_pref.errors import InputError, one_line_errors
 
 GROUPS = ("policy", "task", "question", "human", "belief")
 """Groups of which ``<group>=<module>:<name>`` chooses something of the user's own."""
 
-CODE = (*(f"{group}.make" for group in GROUPS), "task.features", "task.policy")
+CODE_KEYS = tuple(
+    dict.fromkeys(f"{group}.{key}" for group in GROUPS for key in ("make", *CODE.get(group, ())))
+)
 """Keys that name code of the user's, as ``<module>:<name>``."""
 
 
@@ -113,26 +116,18 @@ def _meant(text: str) -> str:
     typed = re.search(r"Could not override '([\w.]+)'", text)
     if typed is None:
         return ""
-    known: set[str] = set()
-    for path in sorted((Path(__file__).parent / "conf").rglob("*.yaml")):
-        group = path.parent.name if path.parent.name != "conf" else ""
-        plain = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
-        known |= {group} | (_keys(plain, f"{group}." if group else ""))
-    close = difflib.get_close_matches(typed[1], sorted(known - {""}), 1, 0.75)
+    known = {
+        key.name if path.parent == CONF else f"{path.parent.name}.{key.name}"
+        for path in CONF.rglob("*.yaml")
+        for key in keys_of(path)
+        if key.name != "name"
+    }
+    known |= {key.partition(".")[0] for key in known}
+    close = difflib.get_close_matches(typed[1], sorted(known), 1, 0.75)
     ends = [key for key in sorted(known) if key.endswith(f".{typed[1]}")]
     if typed[1] in known:
         return f"; {typed[1]} belongs to another choice than the one made here"
     return "".join(f"; did you mean {key}?" for key in (close or ends)[:1])
-
-
-def _keys(plain: Any, prefix: str) -> set[str]:
-    """The dotted keys of a file of settings."""
-    if not isinstance(plain, dict):
-        return set()
-    keys = {f"{prefix}{key}" for key in plain if key not in ("defaults", "hydra", "name")}
-    return keys.union(
-        *(_keys(value, f"{prefix}{key}.") for key, value in plain.items() if key != "hydra")
-    )
 
 
 @contextlib.contextmanager
@@ -214,7 +209,7 @@ def was_typed(key: str) -> bool:
 
 def typed_code() -> list[str]:
     """The keys by which the user typed what code of theirs may be imported."""
-    return [key for key in CODE if was_typed(key)]
+    return [key for key in CODE_KEYS if was_typed(key)]
 
 
 def refuse_other_overrides(

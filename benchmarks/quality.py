@@ -27,7 +27,6 @@ from tqdm import tqdm
 
 from benchmarks import common
 from torchrl_pref.build import (
-    draw_pool,
     load_policy,
     make_feed_env,
     make_pools,
@@ -96,8 +95,7 @@ def run_pool(job: Job) -> list[list[list[float]]]:
     common.one_thread()
     shipped = [pretrained_checkpoint(job.cell.setup, str(job.cell.tau), s) for s in range(SEEDS)]
     settings = shipped[0].settings
-    train, _ = make_pools(settings)
-    test = draw_pool(settings, job.pool)
+    train, test = make_pools(settings, job.pool)
     task = make_task(train, test, job.cell.tau, settings)
     make = make_feed_env if job.cell.setup == "feed" else make_query_env
 

@@ -42,10 +42,10 @@ def check_groups(settings: Settings) -> None:
     """
     own_pools = settings["pool"]["train"] is not None
     n_options = None if own_pools else settings["pool"]["options"]
-    question = make("question", settings["question"])
+    question, tried = make("question", settings["question"]), None
     if n_options is not None:
         question.answers(n_options)
-        _try_task(settings)
+        tried = _try_task(settings)
     taus = settings["tau"] if isinstance(settings["tau"], list) else [settings["tau"]]
     for tau in taus:
         human, belief = settings["human"], settings["belief"]
@@ -57,21 +57,21 @@ def check_groups(settings: Settings) -> None:
                 model.n_answers(n_options)  # or it is refused here
             made = make(group, section, model, without=ANSWERING)
             weighs = group == "human" and made.step_weights(1) is not None
-            if weighs and n_options is not None:
-                weigh_steps(settings, made, draw_pool(settings, 0, 1))
+            if weighs and tried is not None:
+                weigh_steps(settings, made, tried)
     if settings.get("policy", {}).get("name", "pretrained") != "pretrained":
         find("policy", settings["policy"])
 
 
-def _try_task(settings: Settings) -> None:
-    """Make the task, and two trajectories of it.
+def _try_task(settings: Settings) -> QueryPool:
+    """Make the task, and a query about it.
 
     Raises:
         InputError: it cannot be made, or fails.
     """
     task = make("task", settings["task"])
     try:
-        make_pool(task, 1, settings["pool"]["options"], seed=0)
+        return make_pool(task, 1, settings["pool"]["options"], seed=0)
     except InputError:
         raise
     except Exception as error:
@@ -81,11 +81,12 @@ def _try_task(settings: Settings) -> None:
         ) from error
 
 
-def make_pools(settings: Settings) -> tuple[QueryPool, QueryPool]:
+def make_pools(settings: Settings, test_seed: int | None = None) -> tuple[QueryPool, QueryPool]:
     """Training and test pool, not normalised: of files where they are named, else of the task.
 
     Args:
         settings: the sections ``task`` and ``pool``.
+        test_seed: of a test pool of the task; None: the one that follows the training pool's.
 
     Raises:
         InputError: a setting or a file cannot be used.
@@ -107,14 +108,8 @@ def make_pools(settings: Settings) -> tuple[QueryPool, QueryPool]:
         return QueryPool.load(str(pool["train"])), QueryPool.load(str(pool["test"]))
     train, test = make("task", settings["task"]).split(pool["seed"])
     sizes = pool["size"], pool["options"]
-    return make_pool(train, *sizes, first_seed), make_pool(test, *sizes, first_seed + 2)
-
-
-def draw_pool(settings: Settings, seed: int, size: int | None = None) -> QueryPool:
-    """A pool to test on, not normalised, by the sections ``task`` and ``pool``, or of a size."""
-    pool = settings["pool"]
-    _, test = make("task", settings["task"]).split(pool["seed"])
-    return make_pool(test, size or pool["size"], pool["options"], seed)
+    second_seed = first_seed + 2 if test_seed is None else test_seed
+    return make_pool(train, *sizes, first_seed), make_pool(test, *sizes, second_seed)
 
 
 def make_demonstrations(settings: Settings) -> Demonstrations:

@@ -72,14 +72,18 @@ def check_flag(name: str, value: Any) -> bool:
     return value
 
 
+def _is_number(value: Any) -> bool:
+    """Whether it is a number, and neither true nor false."""
+    return not isinstance(value, bool) and isinstance(value, (int, float))
+
+
 def check_positive(name: str, value: Any) -> float:
     """Return ``value`` as a float if it is a finite number above zero.
 
     Raises:
         InputError: it is not.
     """
-    number = not isinstance(value, bool) and isinstance(value, (int, float))
-    if not number or not math.isfinite(value) or value <= 0:
+    if not _is_number(value) or not math.isfinite(value) or value <= 0:
         raise InputError(f"{name}={value!r}: expected a finite number above 0, such as {name}=1.0")
     return float(value)
 
@@ -90,8 +94,7 @@ def check_not_negative(name: str, value: Any) -> float:
     Raises:
         InputError: it is not.
     """
-    number = not isinstance(value, bool) and isinstance(value, (int, float))
-    if not number or not math.isfinite(value) or value < 0:
+    if not _is_number(value) or not math.isfinite(value) or value < 0:
         raise InputError(f"{name}={value!r}: expected a finite number of at least 0")
     return float(value)
 
@@ -102,8 +105,7 @@ def check_between(name: str, value: Any, low: float, high: float) -> float:
     Raises:
         InputError: it is not.
     """
-    number = not isinstance(value, bool) and isinstance(value, (int, float))
-    if not number or not low <= value <= high:
+    if not _is_number(value) or not low <= value <= high:
         raise InputError(f"{name}={value!r}: expected a number from {low:g} to {high:g}")
     return float(value)
 
@@ -114,8 +116,7 @@ def check_finite_number(name: str, value: Any) -> float:
     Raises:
         InputError: it is not.
     """
-    number = not isinstance(value, bool) and isinstance(value, (int, float))
-    if not number or not math.isfinite(value):
+    if not _is_number(value) or not math.isfinite(value):
         raise InputError(f"{name}={value!r}: expected a finite number, such as {name}=0.5")
     return float(value)
 
@@ -126,8 +127,7 @@ def check_share(name: str, value: Any) -> float:
     Raises:
         InputError: it is not.
     """
-    number = not isinstance(value, bool) and isinstance(value, (int, float))
-    if not number or not 0 <= value <= 1:
+    if not _is_number(value) or not 0 <= value <= 1:
         raise InputError(f"{name}={value!r}: expected a number from 0 to 1, such as {name}=0.5")
     return float(value)
 

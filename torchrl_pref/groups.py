@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_pref.beliefs import BELIEFS
+from torchrl_pref.config.sections import CODE
 from torchrl_pref.errors import InputError, check_choice
 from torchrl_pref.humans import HUMANS
 from torchrl_pref.policies import POLICIES
@@ -33,9 +34,6 @@ TABLES: dict[str, Mapping[str, Callable[..., Any]]] = {
 
 OWN = "own"
 """The name in any group of what the user brings, by ``make``: ``module:name``."""
-
-CODE = {"task": ("make", "features", "policy")}
-"""By group, settings of what is in its table that name code of the user's, as ``module:name``."""
 
 _typed: set[str] = set()
 

@@ -151,10 +151,12 @@ def test_no_two_pools_share_a_seed(monkeypatch: pytest.MonkeyPatch) -> None:
         return trajectories(task, count, seed)
 
     monkeypatch.setattr(GridworldTask, "trajectories", watched)
+    make_pools(settings_of("feed"))
+    assert len(set(seeds)) == 4
     for pool in range(heldout.POOLS):
         task_and_pool(Job(settings_of("feed"), Cell("feed", "noisy"), pool))
-    per_call = 2 * 3  # training, test, and the pool itself
-    assert len(seeds) == per_call * heldout.POOLS
+    per_call = 2 * 2  # the training pool, and the job's own
+    assert len(seeds) == 4 + per_call * heldout.POOLS
     assert len(set(seeds)) == 4 + 2 * heldout.POOLS
 
 

@@ -45,7 +45,8 @@ class BeliefBase(ABC):
     n_samples: int
 
     def __repr__(self) -> str:
-        numbers = (f"{k}={v}" for k, v in vars(self).items() if k != "response_model")
+        public = (item for item in vars(self).items() if not item[0].startswith("_"))
+        numbers = (f"{k}={v}" for k, v in public if k != "response_model")
         return f"{type(self).__name__}({', '.join(numbers)})"
 
     def rationality(self, samples: Tensor) -> Tensor:

@@ -21,7 +21,7 @@ from torch import Generator, Tensor
 
 from torchrl_pref.beliefs.lapses import LapseRates
 from torchrl_pref.beliefs.sampled import Belief
-from torchrl_pref.beliefs.slice import MAX_SHRINKS, Target
+from torchrl_pref.beliefs.slice import MAX_SHRINKS, Target, slice_sample
 from torchrl_pref.errors import InputError, check_positive
 from torchrl_pref.questions.base import Evidence
 from torchrl_pref.questions.response_model import ResponseModel
@@ -67,7 +67,7 @@ class RationalityBelief(Belief):
                 f"belief.spread={spread}: expected a factor of at least 1, and at most 1e6; 1 is a "
                 "tau that is known"
             )
-        _ = self._rates  # or its lapse rate is refused here
+        self._rates = LapseRates(response_model) if response_model.lapse else None
 
     def prior(self, n_sessions: int, n_features: int, generator: Generator) -> Tensor:
         """Samples of the prior, (S M D)."""
@@ -76,11 +76,6 @@ class RationalityBelief(Belief):
             (n_sessions, self.n_samples, 1), generator=generator, device=generator.device
         )
         return omega * self.spread ** normal.clamp(-FARTHEST, FARTHEST)
-
-    @property
-    def _rates(self) -> LapseRates | None:
-        """What is believed of the lapse rate; None: that there are no lapses."""
-        return LapseRates(self.response_model) if self.response_model.lapse else None
 
     def _foreseen(self, samples: Tensor, answers: Evidence) -> Tensor:
         """See :meth:`Belief._foreseen`."""
@@ -125,14 +120,9 @@ def move_lengths(omega: Tensor, uniform: Tensor, target: Target, deviation: floa
     Returns:
         (S M 1), the lengths that they get.
     """
-    answers, scales = target.answers, target.scales
-    assert scales is not None
-    size = (*answers.rows.shape[:-1], omega.shape[1])
-    # Samples are innermost in memory: every operation below then runs along them.
-    gaps = (answers.rows.flatten(1, -2) @ omega.mT).view(size).permute(1, 2, 3, 0, 4).contiguous()
-    raised = answers.offsets.permute(1, 2, 3, 0).unsqueeze(-1).expand_as(gaps).clone()
-    raised[-1] += target.slack.unsqueeze(-1)
-    floor = target.floor()
+    assert target.scales is not None
+    gaps, floor = target.returns(omega), target.floor()
+    raised = target.raised(gaps)
 
     def log_density(log_length: Tensor) -> Tensor:
         """(S M), at log-lengths (S M)."""
@@ -143,16 +133,6 @@ def move_lengths(omega: Tensor, uniform: Tensor, target: Target, deviation: floa
 
     deviation, end = max(deviation, 1e-6), FARTHEST * deviation
     level, *fractions = uniform.unbind(-1)
-    log_length = scales[:, 0].log().clamp(-end, end)
-    threshold = log_density(log_length) + torch.log1p(-level)
-    threshold = threshold.clamp(min=torch.finfo(threshold.dtype).min)
-    low, high = torch.full_like(log_length, -end), torch.full_like(log_length, end)
-    place, found = log_length, torch.zeros_like(log_length, dtype=torch.bool)
-    for fraction in fractions:
-        proposal = torch.lerp(low, high, fraction)
-        accepted = log_density(proposal) >= threshold
-        place = torch.where(accepted & ~found, proposal, place)
-        found |= accepted
-        ahead = proposal > log_length
-        low, high = torch.where(ahead, low, proposal), torch.where(ahead, proposal, high)
-    return place.exp().unsqueeze(-1)
+    here = target.scales[:, 0].log().clamp(-end, end)
+    ends = torch.full_like(here, -end), torch.full_like(here, end)
+    return slice_sample(log_density, here, *ends, level, fractions).exp().unsqueeze(-1)

@@ -15,6 +15,7 @@ sample to the same place, but for rounding at the very edge of a slice.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -56,6 +57,22 @@ class Target(NamedTuple):
         """(S M H) or (S 1 H), of the answers."""
         floor = self.answers.floor.unsqueeze(1)
         return floor if self.scales is None else floor * self.scales[:, 1].unsqueeze(-1)
+
+    def returns(self, vectors: Tensor) -> Tensor:
+        """(H F J S M), of the answers' rows under vectors (S M D).
+
+        Samples are innermost in memory: what is computed of them then runs along them.
+        """
+        rows = self.answers.rows
+        flat = (rows.flatten(1, -2) @ vectors.mT).view(*rows.shape[:-1], vectors.shape[1])
+        return flat.permute(1, 2, 3, 0, 4).contiguous()
+
+    def raised(self, returns: Tensor) -> Tensor:
+        """By what the returns (H F J S M) are raised: the offsets, and the slack of the last."""
+        offsets = self.answers.offsets.permute(1, 2, 3, 0).unsqueeze(-1)
+        raised = offsets.expand_as(returns).clone()
+        raised[-1] += self.slack.unsqueeze(-1)
+        return raised
 
     def of(self, sessions: Tensor) -> Target:
         """The same for some of the sessions."""
@@ -126,13 +143,8 @@ def _tensor_move(samples: Tensor, poles: Tensor, uniform: Tensor, target: Target
     tangents = across / height
     pole_angle = torch.atan2(height, along).squeeze(-1)
     # Samples are innermost in memory: every operation below then runs along them.
-    answers = target.answers
-    size = (*answers.rows.shape[:-1], samples.shape[1])
-    rows = answers.rows.flatten(1, -2)
-    cosine = (rows @ samples.mT).view(size).permute(1, 2, 3, 0, 4).contiguous()
-    sine = (rows @ tangents.mT).view(size).permute(1, 2, 3, 0, 4).contiguous()
-    raised = answers.offsets.permute(1, 2, 3, 0).unsqueeze(-1).expand_as(cosine).clone()
-    raised[-1] += target.slack.unsqueeze(-1)
+    cosine, sine = target.returns(samples), target.returns(tangents)
+    raised = target.raised(cosine)
     if target.scales is not None:
         cosine, sine = cosine * target.scales[:, 0], sine * target.scales[:, 0]
     floor = target.floor()
@@ -146,9 +158,6 @@ def _tensor_move(samples: Tensor, poles: Tensor, uniform: Tensor, target: Target
         return target.power.unsqueeze(-1) * likelihood + meridians * meridian
 
     place, level, *fractions = uniform.unbind(-1)
-    angle = torch.zeros_like(pole_angle)
-    threshold = log_density(angle) + torch.log1p(-level)
-    threshold = threshold.clamp(min=torch.finfo(threshold.dtype).min)  # the impossible stays below
     # Of two features there is but one circle, and going round it reaches every mode.
     arc = (ARC * poles.norm(dim=-1)).clamp(min=0 if meridians else 2 * math.pi, max=2 * math.pi)
     high = place * arc
@@ -156,16 +165,40 @@ def _tensor_move(samples: Tensor, poles: Tensor, uniform: Tensor, target: Target
     circles = (part.flatten(0, 2) for part in (cosine, sine, raised))
     first, last = target.response_model.possible_arc(*circles)
     low, high = torch.maximum(high - arc, first), torch.minimum(high, last)
-    found = torch.zeros_like(angle, dtype=torch.bool)
+    here = torch.zeros_like(pole_angle)
+    angle = slice_sample(log_density, here, low, high, level, fractions).unsqueeze(-1)
+    return F.normalize(samples * angle.cos() + tangents * angle.sin(), dim=-1)
+
+
+def slice_sample(
+    log_density: Callable[[Tensor], Tensor],
+    here: Tensor,
+    low: Tensor,
+    high: Tensor,
+    level: Tensor,
+    fractions: Sequence[Tensor],
+) -> Tensor:
+    """New places (S M) in the slices of a density, from an interval that shrinks to each proposal
+    that is refused.
+
+    Args:
+        log_density: from places (S M) to its logarithm (S M).
+        here: (S M), where the samples are; they stay where no proposal is in the slice.
+        low, high: (S M), ends of the interval, about ``here``.
+        level: (S M), in [0, 1), of the slice.
+        fractions: (S M) each, in [0, 1), one for each proposal.
+    """
+    threshold = log_density(here) + torch.log1p(-level)
+    threshold = threshold.clamp(min=torch.finfo(threshold.dtype).min)  # the impossible stays below
+    place, found = here, torch.zeros_like(here, dtype=torch.bool)
     for fraction in fractions:
         proposal = torch.lerp(low, high, fraction)
         accepted = log_density(proposal) >= threshold
-        angle = torch.where(accepted & ~found, proposal, angle)
+        place = torch.where(accepted & ~found, proposal, place)
         found |= accepted
-        ahead = proposal > 0
+        ahead = proposal > here
         low, high = torch.where(ahead, low, proposal), torch.where(ahead, proposal, high)
-    angle = angle.unsqueeze(-1)
-    return F.normalize(samples * angle.cos() + tangents * angle.sin(), dim=-1)
+    return place
 
 
 def compiled_moves(

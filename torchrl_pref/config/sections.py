@@ -6,6 +6,7 @@ Nothing here has a default: these stand in ``conf/`` alone, and what values are 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NotRequired, TypeAlias, TypedDict
 
 Plain: TypeAlias = dict[str, Any]
@@ -14,6 +15,10 @@ Plain: TypeAlias = dict[str, Any]
 GroupSection: TypeAlias = dict[str, Any]
 """The section of a group: its ``name``, and the arguments of what that stands for, which may be a
 stranger's class."""
+
+
+CODE = {"task": ("make", "features", "policy")}
+"""By group, settings of what is in its table that name code of the user's, as ``module:name``."""
 
 
 class PoolSection(TypedDict):
@@ -102,3 +107,13 @@ class Settings(TypedDict):
     strategy: NotRequired[str | list[str] | None]
     # Of both: a file to start from, or those to compare.
     checkpoint: NotRequired[Any]
+
+
+def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings by their dotted keys."""
+    found: dict[str, Any] = {}
+    for key, value in settings.items():
+        found |= (
+            flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+        )
+    return found

@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from torchrl_pref.checkpoints.checkpoint import Checkpoint
 from torchrl_pref.compiled import share_out
-from torchrl_pref.config.sections import Plain, Settings
+from torchrl_pref.config.sections import Plain, Settings, flat
 from torchrl_pref.errors import InputError
 from torchrl_pref.evaluation.comparison import policy_key
 from torchrl_pref.evaluation.heldout_pool import (
@@ -31,6 +31,7 @@ from torchrl_pref.evaluation.heldout_pool import (
 )
 from torchrl_pref.evaluation.records import Records
 from torchrl_pref.groups import OWN, TABLES, allow, allowed, make
+from torchrl_pref.tasks.base import Task
 
 POOLS, BALANCED_POOLS = 10, 3
 
@@ -81,11 +82,11 @@ def _jobs(
     settings: Settings, learned: Mapping[Cell, Sequence[Checkpoint]], own: Sequence[str]
 ) -> list[Job]:
     """A job for each pool of each cell, whose thresholds are yet to be fitted."""
-    jobs = []
+    jobs, task = [], make("task", settings["task"])
     for cell, checkpoints in learned.items():
         for checkpoint in checkpoints:
             _check_fits(settings, cell, checkpoint, checkpoints[0])
-            _check_unseen(settings, checkpoint)
+            _check_unseen(settings, task, checkpoint)
         kinds = kinds_of(checkpoints)
         settings = {**settings, "skip": checkpoints[0].settings["skip"]}
         cells = [(cell._replace(features=features_of(settings)), POOLS)]
@@ -149,28 +150,19 @@ def kinds_of(checkpoints: Sequence[Checkpoint]) -> dict[str, list[Checkpoint]]:
     kind = policy_key(checkpoints[0].settings)
     if len(groups) == 1:
         return {kind: groups[0][1]}
-    flats = [_flat(settings) for settings, _ in groups]
+    flats = [flat(settings) for settings, _ in groups]
     keys = {}
-    for flat, (_, members) in zip(flats, groups, strict=True):
-        like = [other for other in flats if other["policy.name"] == flat["policy.name"]]
-        differing = [name for name in flat if any(o.get(name) != flat[name] for o in like)]
-        which = [flat["policy.name"], *(f"{name}={flat[name]}" for name in differing)]
+    for own_flat, (_, members) in zip(flats, groups, strict=True):
+        like = [other for other in flats if other["policy.name"] == own_flat["policy.name"]]
+        differing = [name for name in own_flat if any(o.get(name) != own_flat[name] for o in like)]
+        which = [own_flat["policy.name"], *(f"{name}={own_flat[name]}" for name in differing)]
         keys[f"{kind}:{', '.join(which)}"] = members
     return keys
 
 
-def _flat(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Values by dotted key."""
-    flat: dict[str, Any] = {}
-    for key, value in settings.items():
-        inner = value.items() if isinstance(value, dict) else ()
-        flat |= {f"{key}.{name}": each for name, each in inner} if inner else {key: value}
-    return flat
-
-
-def _check_unseen(settings: Settings, checkpoint: Checkpoint) -> None:
+def _check_unseen(settings: Settings, task: Task, checkpoint: Checkpoint) -> None:
     """Refuse to judge a policy on recorded trajectories that it was trained on."""
-    task, trained = make("task", settings["task"]), checkpoint.settings
+    trained = checkpoint.settings
     recorded = task.split(0)[0] is not task
     mine, theirs = settings["pool"]["seed"], trained["pool"]["seed"]
     if recorded and trained["task"] == settings["task"] and mine != theirs:

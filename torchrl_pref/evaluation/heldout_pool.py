@@ -16,7 +16,6 @@ from torch import Tensor
 
 from torchrl_pref.acquisition.functions import alignment_gain, information_gain, volume_removal
 from torchrl_pref.build import (
-    draw_pool,
     load_policy,
     make_feed_env,
     make_pools,
@@ -112,10 +111,8 @@ class Job:
 def task_and_pool(job: Job) -> tuple[Problem, QueryPool]:
     """The task, with tau solved on the training pool, and the job's own test pool."""
     settings = job.settings
-    train, test = make_pools(settings)
-    if job.cell.features != "own":
-        # A pool takes two seeds.
-        test = draw_pool(settings, FIRST_SEED + 2 * job.pool)
+    # A pool takes two seeds.
+    train, test = make_pools(settings, FIRST_SEED + 2 * job.pool)
     if job.cell.features == "balanced":
         train, test = (each.map_features(balance(train.features)) for each in (train, test))
     task = make_task(train, test, job.cell.tau, settings)

@@ -14,7 +14,7 @@ from torch import Generator, Tensor
 from torch.nn import functional as F
 
 from torchrl_pref.errors import check_not_negative
-from torchrl_pref.humans.simulated import SimulatedHuman
+from torchrl_pref.humans.simulated import SimulatedHuman, at_turn
 from torchrl_pref.questions.response_model import ResponseModel
 
 
@@ -54,7 +54,6 @@ class Drifting(SimulatedHuman):
         self, queries: Tensor, human: TensorDictBase | Mapping[str, Tensor], turn: Tensor
     ) -> Tensor:
         """See :meth:`HumanBase.respond`."""
-        walked = torch.take_along_dim(human["walk"], turn[:, None, None], 1).squeeze(1)
         now = {key: human[key] for key in ("noise", "care")}
-        omega = F.normalize(human["omega"] + walked, dim=-1)
+        omega = F.normalize(human["omega"] + at_turn(human["walk"], turn), dim=-1)
         return super().respond(queries, {**now, "omega": omega}, turn)

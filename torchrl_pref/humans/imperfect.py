@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchrl_pref.errors import InputError, check_finite_number, check_not_negative, check_share
 from torchrl_pref.humans.base import REFUSED
-from torchrl_pref.humans.simulated import SimulatedHuman
+from torchrl_pref.humans.simulated import SimulatedHuman, at_turn
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.questions.responses import Boltzmann
 from torchrl_pref.questions.weak import Weak
@@ -80,7 +80,7 @@ class Undecided(SimulatedHuman):
     ) -> Tensor:
         """See :meth:`HumanBase.respond`: 2 is "about equal"."""
         returns = (queries @ human["omega"].unsqueeze(-1)).squeeze(-1)
-        noise = torch.take_along_dim(human["noise"], turn[:, None, None], 1).squeeze(1)
+        noise = at_turn(human["noise"], turn)
         picked = (self.picks(returns) + noise[:, :2]).argmax(-1)
         gap = self.picks.tau * (returns[:, 0] - returns[:, 1]).abs()
         return torch.where(gap < self.threshold, 2, picked)

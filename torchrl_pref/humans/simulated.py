@@ -61,5 +61,9 @@ class SimulatedHuman(HumanBase):
         """See :meth:`HumanBase.respond`; by the Gumbel-max trick."""
         returns = (queries @ human["omega"].unsqueeze(-1)).squeeze(-1) * human["care"]
         check_finite("the human's returns (queries @ omega * care)", returns)
-        noise = torch.take_along_dim(human["noise"], turn[:, None, None], 1).squeeze(1)
-        return (self.response_model(returns) + noise).argmax(-1)
+        return (self.response_model(returns) + at_turn(human["noise"], turn)).argmax(-1)
+
+
+def at_turn(drawn: Tensor, turn: Tensor) -> Tensor:
+    """Of what was drawn for each question (B H n), the part (B n) for that of the turn (B)."""
+    return torch.take_along_dim(drawn, turn[:, None, None], 1).squeeze(1)

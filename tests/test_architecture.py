@@ -30,6 +30,7 @@ ORDER = [
     "evaluation",
     "training",
     "pretrained",
+    "learned",
     "saved_session",
     "asking",
     "session",

@@ -9,14 +9,29 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Generator
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_pref import Boltzmann, Normalizer, Optimal, QueryPool, Session, Weak, gridworld_pool
+from torchrl_pref import (
+    Boltzmann,
+    FeedEnv,
+    Normalizer,
+    Optimal,
+    QueryPool,
+    Session,
+    Weak,
+    gridworld_pool,
+)
+from torchrl_pref.asking import NothingToAsk
 from torchrl_pref.beliefs.sampled import Belief
+from torchrl_pref.envs.transition import begin, tell
 from torchrl_pref.errors import InputError
 from torchrl_pref.humans.simulated import SimulatedHuman
+from torchrl_pref.pretrained import pretrained_policy
 from torchrl_pref.questions.prior_evidence import correction, demonstration
-from torchrl_pref.strategies import STRATEGIES, RandomQuery
+from torchrl_pref.strategies import FEED_STRATEGIES, STRATEGIES, RandomQuery
 
 MODEL = Boltzmann(3.0)
 
@@ -266,3 +281,119 @@ def test_importing_it_takes_neither_collectors_nor_plotting() -> None:
     code += f"print([name for name in {heavy!r} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("strategy", ["random", "alignment_gain", "policy"])
+def test_a_feed_shows_what_the_environment_would(strategy: str) -> None:
+    """Against the environment itself, on the same offers and with the same answers."""
+    pool, omega = gridworld_pool(300), torch.tensor([0.5, -0.5, 0.5, 0.5])
+    pool = pool.map_features(Normalizer.fit(pool.features))
+    session = Session(pool, MODEL, strategy, budget=6, setup="feed", offers=25, seed=3)
+    env = FeedEnv(
+        pool, SimulatedHuman(MODEL), Belief(MODEL), 6, 25, skip="free", batch_size=(1,), seed=3
+    )
+    if strategy == "policy":
+        module = pretrained_policy(env, "noisy").strategy
+    else:
+        module = FEED_STRATEGIES[strategy](env)
+    offers = Generator().manual_seed(3)
+    stream = torch.randint(300, (1, 25), generator=offers)
+    luck = Generator().manual_seed(3)
+    state = begin(Belief(MODEL).prior(1, 4, luck), 6, 2)
+    place, n_told = 0, 0
+    while n_told < 6:
+        state["n_offered"] = torch.tensor([[place]])
+        with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+            asks = int(module(env.show(state, {"offers": stream}))["action"])
+        index = stream[:, place]
+        place += 1
+        if asks:
+            assert int(session.ask().query) == int(index)
+            answer = (pool.features[index] @ omega).argmax(-1)
+            session.tell(int(answer))
+            luck = Generator().manual_seed(3 * 1_000_003 + n_told)
+            state = tell(Belief(MODEL), state, pool.features[index], answer, index, luck)
+            n_told += 1
+            assert torch.equal(session.samples, state["samples"][0])
+    if strategy == "random":
+        assert place == 6
+    again = Session.from_dict(session.to_dict(), pool, MODEL, strategy)
+    assert again.to_dict() == session.to_dict()
+
+
+def test_a_feed_ends_with_its_offers() -> None:
+    class Never(TensorDictModuleBase):
+        in_keys, out_keys = ["offer"], ["action"]
+
+        def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+            return tensordict.set("action", torch.zeros(1, dtype=torch.long))
+
+    pool = gridworld_pool(50)
+    session = Session(pool, MODEL, lambda env: Never(), budget=3, setup="feed", offers=7)
+    with pytest.raises(NothingToAsk, match="offers=7: all went by"):
+        session.ask()
+
+
+def test_an_earlier_answer_is_taken_back_and_the_others_stay(generator: Generator) -> None:
+    """As though its question had been put off to the end."""
+    pool = QueryPool(torch.randn(60, 2, 3, generator=generator))
+    session = Session(pool, MODEL, budget=6, seed=2)
+    asked = converse(session, torch.ones(3), 5)
+    answers = [turn[0] for turn in session.to_dict()["answers"]]
+    session.undo(1)
+    assert session.n_answered == 4
+    assert int(session.ask().query) == asked[1]
+    session.tell(1 - answers[1])
+    content = session.to_dict()
+    assert [query[0] for query in content["queries"]] == [asked[0], *asked[2:], asked[1]]
+    again = Session(pool, MODEL, budget=6, seed=2)
+    again = Session.from_dict({**again.to_dict(), **content}, pool, MODEL)
+    assert torch.equal(again.samples, session.samples)
+    for bad in (5, -6, 1.0, True, "0"):
+        with pytest.raises(InputError, match="nothing to undo"):
+            session.undo(bad)  # type: ignore[arg-type]
+
+
+def test_a_branch_goes_its_own_way(generator: Generator) -> None:
+    pool = QueryPool(torch.randn(60, 2, 3, generator=generator))
+    session = Session(pool, MODEL, budget=6, seed=2)
+    converse(session, torch.ones(3), 2)
+    session.ask()
+    before, samples = session.to_dict(), session.samples.clone()
+    branches = [session.branch() for _ in range(2)]
+    for answer, branch in enumerate(branches):
+        branch.tell(answer)
+        branch.ask()
+    assert session.to_dict() == before
+    assert torch.equal(session.samples, samples)
+    session.tell(1)
+    session.ask()
+    assert session.to_dict() == branches[1].to_dict() != branches[0].to_dict()
+
+
+def test_what_is_known_is_told_as_counted_by_hand(generator: Generator) -> None:
+    features = torch.randn(60, 2, 3, generator=generator)
+    session = Session(features, Boltzmann(2.0), budget=6, seed=2)
+    converse(session, torch.ones(3), 3)
+    session.ask()
+    session.tell(None)
+    samples = session.samples.double()
+    content = session.to_dict()
+    fits = []
+    for (query,), (answer,) in zip(content["queries"], content["answers"], strict=True):
+        gap = 2.0 * samples @ (features[query, 0] - features[query, 1]).double()
+        sign = 1 if answer == 0 else -1
+        fits.append(1.0 if answer < 0 else float((1 / (1 + (-sign * gap).exp())).mean()))
+    assert session.likelihoods.tolist() == pytest.approx(fits, abs=1e-5)
+    alignment = session.expected_alignment
+    assert len(alignment) == 5
+    assert float(alignment[-1]) == pytest.approx(float(samples.mean(0).norm()), abs=1e-5)
+    assert alignment[-1] == alignment[-2]  # nothing was said
+    options = session.ask().features.double()
+    first = 1 / (1 + (-2.0 * samples @ (options[0] - options[1])).exp())
+    expected = 0.0
+    for probability in (first, 1 - first):
+        mean = (probability[:, None] * samples).mean(0) / probability.mean()
+        expected += float(probability.mean() * mean.square().sum())
+    gain = expected**0.5 - float(samples.mean(0).norm())
+    assert float(session.expected_gain) == pytest.approx(gain, abs=1e-5)

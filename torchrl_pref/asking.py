@@ -1,20 +1,67 @@
-"""What a live person is asked by: a strategy by its name, the trained policy, or one's own."""
+"""What a live person is asked, and by what: the parts of a session of questions.
+
+Shapes: B people, N queries in the pool, K options per query, D features, O offers.
+"""
 
 from __future__ import annotations
 
-from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import EnvBase
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torch import Generator, Tensor
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torchrl_pref.beliefs.base import BeliefBase
+from torchrl_pref.envs.feed import FeedEnv
+from torchrl_pref.envs.query import QueryEnv
+from torchrl_pref.envs.session import is_feed
+from torchrl_pref.envs.transition import SessionState, Tree
 from torchrl_pref.errors import InputError, check_choice, check_type
-from torchrl_pref.strategies import STRATEGIES, MakeStrategy
+from torchrl_pref.humans.simulated import SimulatedHuman
+from torchrl_pref.pool import QueryPool
+from torchrl_pref.strategies import FEED_STRATEGIES, STRATEGIES, MakeStrategy
+
+
+class NothingToAsk(InputError):
+    """The session is over: its budget is used up, or all offers went by."""
+
+
+class Asked(NamedTuple):
+    """A question to show; with one person the leading B is left out."""
+
+    query: Tensor
+    """(B), its index in the pool."""
+    features: Tensor
+    """(B K D), of its options, as in the pool."""
+    trajectories: Tensor | None
+    """(B K …), what the person is shown, where the pool has it."""
+
+
+def make_env(
+    pool: QueryPool, belief: BeliefBase, setup: str, people: int, seed: int, **options: Any
+) -> QueryEnv | FeedEnv:
+    """The environment in which a strategy decides; nobody answers there.
+
+    Raises:
+        InputError: ``setup`` is another word, or an option cannot be used.
+    """
+    check_choice("setup", setup, ("query", "feed"))
+    nobody = SimulatedHuman(belief.response_model)
+    common: dict[str, Any] = {"batch_size": (people,), "seed": seed, "budget": options["budget"]}
+    if setup == "query":
+        return QueryEnv(pool, nobody, belief, repeats=options["repeats"], **common)
+    return FeedEnv(pool, nobody, belief, offers=options["offers"], skip="free", **common)
 
 
 def strategy_of(strategy: str | MakeStrategy, env: EnvBase) -> TensorDictModuleBase:
-    """What asks in an environment of queries.
+    """What asks in an environment.
 
     Args:
-        strategy: a name of ``strategies.STRATEGIES``, ``policy``, or a function from an environment
-            to a module that writes ``action``.
+        strategy: a name of ``strategies.STRATEGIES``, in a feed of ``FEED_STRATEGIES``;
+            ``policy``; or a function from an environment to a module that writes ``action``.
         env: the environment.
 
     Raises:
@@ -26,7 +73,8 @@ def strategy_of(strategy: str | MakeStrategy, env: EnvBase) -> TensorDictModuleB
         kind = "noisy" if env.belief.response_model.is_soft else "optimal"
         return pretrained_policy(env, kind).strategy
     if isinstance(strategy, str):
-        return STRATEGIES[check_choice("strategy", strategy, (*STRATEGIES, "policy"))](env)
+        known = FEED_STRATEGIES if is_feed(env) else STRATEGIES
+        return known[check_choice("strategy", strategy, (*known, "policy"))](env)
     if not callable(strategy) or isinstance(strategy, TensorDictModuleBase):
         raise InputError(
             f"strategy of type {type(strategy).__name__}: expected a function from an environment "
@@ -35,3 +83,65 @@ def strategy_of(strategy: str | MakeStrategy, env: EnvBase) -> TensorDictModuleB
     made = strategy(env)
     check_type("what strategy makes of an environment", made, TensorDictModuleBase, "Greedy(…)")
     return made
+
+
+@torch.no_grad()
+def next_question(
+    env: QueryEnv | FeedEnv,
+    strategy: TensorDictModuleBase,
+    state: SessionState,
+    hidden: Tree,
+    luck: int,
+) -> tuple[Tensor, Tensor | None]:
+    """The pool index (B) of what is asked next, and in a feed how many offers (B 1) went by then.
+
+    Args:
+        env: where the strategy decides.
+        strategy: writes ``action``.
+        state: of the sessions; in a feed with ``n_offered`` (B 1).
+        hidden: as :meth:`SessionEnv.draw_questions` drew it.
+        luck: seeds the strategy's own generators.
+
+    Raises:
+        NothingToAsk: all offers of one of the people went by.
+    """
+    for module in strategy.modules():
+        if isinstance(getattr(module, "generator", None), Generator):
+            module.generator.manual_seed(luck)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        if isinstance(env, QueryEnv):
+            return strategy(env.show(state, hidden))["action"], None
+        return _let_through(env, strategy, state, hidden)
+
+
+def _let_through(
+    env: FeedEnv, strategy: TensorDictModuleBase, state: SessionState, hidden: Tree
+) -> tuple[Tensor, Tensor]:
+    """See :func:`next_question`: offers go by until each person has one that is asked."""
+    index, n_offered = torch.full(tuple(env.batch_size), -1), state["n_offered"]
+    while (waiting := index < 0).any():
+        if (n_offered.squeeze(-1)[waiting] >= env.n_offers).any():
+            raise NothingToAsk(
+                f"offers={env.n_offers}: all went by; expected more offers where more are to be "
+                "asked"
+            )
+        present: SessionState = {**state, "n_offered": n_offered}
+        asks = strategy(env.show(present, hidden))["action"] == 1
+        index = torch.where(waiting & asks, env.offered(present, hidden), index)
+        n_offered = n_offered + waiting.unsqueeze(-1)
+    return index, n_offered
+
+
+def check_same(content: Mapping[str, Any], made_with: Mapping[str, Any]) -> None:
+    """Refuse a saved session that was made with something else.
+
+    Raises:
+        InputError: it was.
+    """
+    for key in ("pool", "response_model", "belief", "strategy", "given"):
+        was = content.get(key)  # sessions of earlier versions were given nothing
+        if was != made_with[key]:
+            raise InputError(
+                f"{key}: the session was made with {was!s:.80}, and this is "
+                f"{made_with[key]!s:.80}; expected the same"
+            )

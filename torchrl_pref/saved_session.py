@@ -9,6 +9,9 @@ from torchrl_pref.errors import InputError
 FORMAT = 1
 """Of what ``Session.to_dict`` makes."""
 
+EARLIER = {"given": None, "setup": "query", "offers": None, "offered": None}
+"""What sessions of earlier versions do not say of themselves."""
+
 
 def check_content(content: Any) -> None:
     """Refuse what ``Session.to_dict`` did not make.
@@ -37,10 +40,13 @@ def check_content(content: Any) -> None:
         "answers": turns,
         "given": lambda value: value is None or isinstance(value, str),
         "asked": lambda value: value is None or numbers(value),
+        "setup": lambda value: value in ("query", "feed"),
+        "offers": lambda value: value is None or type(value) is int,
+        "offered": lambda value: value is None or numbers(value),
     }
     if not isinstance(content, dict):
         raise InputError(f"a session of type {type(content).__name__}: expected a dict")
-    content = {"given": None, **content}  # sessions of earlier versions were given nothing
+    content = {**EARLIER, **content}
     for key, fits in checks.items():
         if key not in content or not fits(content[key]):
             raise InputError(

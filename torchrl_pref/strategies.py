@@ -289,3 +289,9 @@ STRATEGIES: dict[str, MakeStrategy] = {
     "lookahead": lambda env: Lookahead(env.belief.response_model),
 }
 """Strategies that choose from candidates, by name: greedy ones by that of what they maximise."""
+
+FEED_STRATEGIES: dict[str, MakeStrategy] = {
+    "random": lambda env: RandomAsk(),
+    **{name: partial(QuantileAsk, acquisition=each) for name, each in ACQUISITIONS.items()},
+}
+"""Strategies that ask or skip what is offered, by name: all that is offered, or the best share."""

@@ -78,7 +78,8 @@ class FeedEnv(SessionEnv):
         """O: a session that asks less sees every offer."""
         return self.n_offers
 
-    def _draw_questions(self, size: int) -> dict[str, Tensor]:
+    def draw_questions(self, size: int) -> dict[str, Tensor]:
+        """(B O), pool indices of what streams by in B sessions: hidden."""
         n_queries, shape = len(self.features), (size, self.n_offers)
         offers = torch.randint(n_queries, shape, generator=self.generator, device=self.device)
         return {"offers": offers}
@@ -87,7 +88,7 @@ class FeedEnv(SessionEnv):
         n_offered = torch.zeros_like(session["n_asked"])
         return {**super()._counted(session, number), "n_offered": n_offered}
 
-    def _offered(self, session: SessionState, hidden: Tree) -> Tensor:
+    def offered(self, session: SessionState, hidden: Tree) -> Tensor:
         """(B), pool index of the query on offer; after the last offer, the last one."""
         place = session["n_offered" if self.on_skip == "new" else "n_asked"]
         return hidden["offers"].gather(-1, place.clamp(max=self.n_offers - 1)).squeeze(-1)
@@ -97,13 +98,13 @@ class FeedEnv(SessionEnv):
         offers_left = 1 - n_offered / self.n_offers
         shown["remaining"] = torch.cat([shown["remaining"], offers_left], -1)
         shown["n_offered"] = n_offered.clone()
-        shown["offer"] = self.features[self._offered(session, hidden)]
+        shown["offer"] = self.features[self.offered(session, hidden)]
         return shown
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = self._check_action(tensordict, 2, "1 to ask and 0 to skip")
         hidden, session = self._session_of(tensordict)
-        human, index = hidden["human"], self._offered(session, hidden)
+        human, index = hidden["human"], self.offered(session, hidden)
         n_offered = session["n_offered"]
         going_on = (session["n_asked"] < self.budget) & (n_offered < self.n_offers)
         asks = (action == 1).unsqueeze(-1)

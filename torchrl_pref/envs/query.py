@@ -77,7 +77,8 @@ class QueryEnv(SessionEnv):
         self._table = Table()
         self._make_specs(self.n_candidates)
 
-    def _draw_questions(self, size: int) -> dict[str, Tensor]:
+    def draw_questions(self, size: int) -> dict[str, Tensor]:
+        """(B C), pool indices of the candidates of B sessions, where they are not all: hidden."""
         if self._shows_all:
             return {}
         shape = (size, len(self.features))

@@ -187,7 +187,7 @@ class SessionEnv(EnvBase):
         session = begin(self.belief.prior(size, n_features, rng), self.budget, n_options)
         # The bits of a number of the prior: another one for each session, and no draw more.
         human["number"] = number = session["samples"][:, 0, :1].clone().view(torch.int32)
-        hidden: Tree = {"human": human, **self._draw_questions(size)}
+        hidden: Tree = {"human": human, **self.draw_questions(size)}
         if self.demonstrations.count:
             session = hear(self.belief, session, self._given_by(human), rng)
         return hidden, self._counted(session, number)
@@ -202,7 +202,7 @@ class SessionEnv(EnvBase):
         rows = ratio(self.demonstrations.tau, self.belief.response_model) * rows
         return {"rows": rows, "offsets": torch.zeros_like(rows[..., 0])}
 
-    def _draw_questions(self, size: int) -> dict[str, Tensor]:
+    def draw_questions(self, size: int) -> dict[str, Tensor]:
         """What is drawn of the questions to come, for B sessions: hidden."""
         return {}
 
@@ -220,9 +220,14 @@ class SessionEnv(EnvBase):
             "remaining": 1 - n_asked / self.budget,
         }
 
-    def show(self, session: SessionState) -> TensorDict:
-        """What a strategy sees of sessions (B) that somebody else keeps, as a live person's."""
-        shown = {**self._shown(session, {}), "session": session}
+    def show(self, session: SessionState, hidden: Tree) -> TensorDict:
+        """What a strategy sees of sessions (B) that somebody else keeps, as a live person's.
+
+        Args:
+            session: what is known of them.
+            hidden: what :meth:`draw_questions` drew for them.
+        """
+        shown = {**self._shown(session, hidden), "session": session}
         return TensorDict(shown, self.batch_size, device=self.device)
 
     def _put_on_table(self, shown: dict[str, Tensor], begun: Tensor | None) -> None:

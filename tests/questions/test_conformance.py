@@ -17,7 +17,7 @@ from torchrl_pref.beliefs.sampled import Belief, uniform_sphere
 from torchrl_pref.errors import InputError
 from torchrl_pref.questions import QUESTIONS
 from torchrl_pref.questions.approve import Approve
-from torchrl_pref.questions.base import Question, answers_on
+from torchrl_pref.questions.base import Answers, Question, answers_on, reordered
 from torchrl_pref.questions.best_worst import BestWorst
 from torchrl_pref.questions.choice import Choice
 from torchrl_pref.questions.ranking import Ranking
@@ -110,6 +110,51 @@ def test_who_is_listed_where_makes_no_difference(
     number = torch.tensor(apart.argmin(1))
     assert sorted(number.tolist()) == list(range(len(number)))
     assert torch.allclose(probs, other[:, number], atol=1e-6)
+
+
+@OF_ALL
+def test_what_was_said_of_options_in_another_order(
+    question: Question, n_options: int, generator: Generator
+) -> None:
+    """The answer that was meant is as likely as the one that was said of what was seen."""
+    returns = torch.randn(20, n_options, generator=generator)
+    for _ in range(3):
+        order = tuple(torch.randperm(n_options, generator=generator).tolist())
+        seen = chances(question, returns[:, order].double().numpy(), 2.0)
+        meant = reordered(question, order)
+        assert meant is not None
+        assert sorted(meant) == list(range(len(meant)))
+        there = chances(question, returns.double().numpy(), 2.0)
+        assert np.allclose(seen, there[:, meant], atol=1e-6)
+
+
+@OF_ALL
+def test_what_a_person_points_at_tells_the_answers_apart(
+    question: Question, n_options: int, generator: Generator
+) -> None:
+    """And it is what the formula calls likely: who points at the best first says the likeliest."""
+    places = question.places(n_options)
+    assert places is not None
+    assert len(set(places)) == len(places) == len(labels_of(question, n_options))
+    returns = np.linspace(3.0, -3.0, n_options)[None] if n_options > 1 else np.array([[3.0]])
+    likeliest = chances(question, returns, 2.0)[0].argmax()
+    firsts = {"BestWorst": (0, n_options - 1), "Ranking": tuple(range(n_options))}
+    assert places[likeliest] == firsts.get(type(question).__name__, (0,))
+    assert question.prompt.strip() != Question.prompt
+
+
+def test_questions_that_are_not_alike_for_all_options_are_not_reordered() -> None:
+    class Better(Question):
+        """Is the first better than the second? Yes, no, or surely not."""
+
+        def answers(self, n_options: int) -> Answers:
+            table = answers_on(Choice(), 2, torch.device("cpu"))
+            which = torch.tensor([0, 1, 1])
+            half = torch.tensor([0.0, -math.log(2), -math.log(2)])
+            return Answers(("a", "b", "c"), table.contrasts[which], table.offsets[which], half)
+
+    assert reordered(Better(), (1, 0)) is None
+    assert Better().places(2) is None
 
 
 @pytest.mark.parametrize("lapse", [0.0, 0.1])

@@ -28,8 +28,14 @@ class Approve(Question):
         InputError: the threshold is no number from -100 to 100.
     """
 
+    prompt = "Is this one good?"
+
     def __init__(self, threshold: float = 0.0) -> None:
         self.threshold = check_between("threshold", threshold, -LARGEST, LARGEST)
+
+    def places(self, n_options: int) -> list[tuple[int, ...]]:
+        """See :meth:`Question.places`: yes points at it, and no does not."""
+        return [(), (0,)]
 
     def answers(self, n_options: int) -> Answers:
         """See :meth:`Question.answers`. Answer 0 is no, and 1 is yes."""

@@ -97,7 +97,12 @@ class Question(ABC):
     """A kind of question. Two of the same kind with the same numbers are equal.
 
     Attributes are numbers, texts or tuples of them, as tables are kept by them.
+
+    Attributes:
+        prompt: what a person is asked, in words.
     """
+
+    prompt: str = "What do you say?"
 
     @abstractmethod
     def answers(self, n_options: int) -> Answers:
@@ -107,6 +112,11 @@ class Question(ABC):
         Raises:
             InputError: there is no such question about so many options.
         """
+
+    def places(self, n_options: int) -> list[tuple[int, ...]] | None:
+        """The options that a person points at to give each of the R answers, in the order in which
+        they point; None where answers are told by their labels alone."""
+        return None
 
     def __eq__(self, other: object) -> bool:
         return type(self) is type(other) and vars(self) == vars(other)
@@ -197,6 +207,36 @@ def rows_of(question: Question, options: Tensor, answers: Tensor) -> tuple[Tenso
     rows = (table.contrasts[given].unsqueeze(-1) * options[..., None, None, :, :]).sum(-2)
     offsets = torch.where(there, table.offsets[given], torch.inf)
     return rows * there.unsqueeze(-1), offsets, answers
+
+
+@lru_cache(maxsize=1024)
+def reordered(question: Question, order: tuple[int, ...]) -> list[int] | None:
+    """Which answer a person means who saw the options in another order.
+
+    Args:
+        question: what was asked.
+        order: K, the option at each place.
+
+    Returns:
+        R, by the answer in terms of places the one in terms of options; None where the question
+        does not treat all options alike.
+    """
+    _, contrasts, offsets, log_weights = answers_on(question, len(order), torch.device("cpu"))
+    place_of = [order.index(option) for option in range(len(order))]
+    meant = _as_keys(contrasts, offsets, log_weights)
+    number = {key: answer for answer, key in enumerate(meant)}
+    said = _as_keys(contrasts[..., place_of], offsets, log_weights)
+    found = [number.get(key) for key in said]
+    return None if None in found else [answer for answer in found if answer is not None]
+
+
+def _as_keys(contrasts: Tensor, offsets: Tensor, log_weights: Tensor) -> list[tuple[Any, ...]]:
+    """R keys, equal where answers say the same of the options: factors and rows are in no order."""
+    rows = torch.cat([contrasts, offsets.unsqueeze(-1)], -1) + 0.0  # no negative zeros
+    return [
+        (weight, tuple(sorted(tuple(sorted(map(tuple, factor))) for factor in answer)))
+        for weight, answer in zip(log_weights.tolist(), rows.tolist(), strict=True)
+    ]
 
 
 def check_same(human: Question, belief: Question) -> None:

@@ -26,6 +26,12 @@ class BestWorst(Question):
     ranking.
     """
 
+    prompt = "Which is best, and which is worst?"
+
+    def places(self, n_options: int) -> list[tuple[int, ...]]:
+        """See :meth:`Question.places`: the best, then the worst."""
+        return list(permutations(range(n_options), 2))
+
     def answers(self, n_options: int) -> Answers:
         """See :meth:`Question.answers`. Answers are the K(K-1) pairs of a best and a worst option;
         the first factor has K-1 rows and the second K-2."""

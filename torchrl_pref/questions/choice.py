@@ -12,6 +12,12 @@ from torchrl_pref.questions.base import Answers, Evidence, Question, rows_of
 class Choice(Question):
     """Pick one of K: one factor, in which the pick is preferred to each of the others."""
 
+    prompt = "Which is best?"
+
+    def places(self, n_options: int) -> list[tuple[int, ...]]:
+        """See :meth:`Question.places`."""
+        return [(k,) for k in range(n_options)]
+
     def answers(self, n_options: int) -> Answers:
         """See :meth:`Question.answers`. Answer k is option k."""
         check_count("options", n_options, 2)

@@ -26,6 +26,12 @@ class Ranking(Question):
     first factor is a choice of the best, and of two options a ranking is a choice.
     """
 
+    prompt = "Put them in order, the best first."
+
+    def places(self, n_options: int) -> list[tuple[int, ...]]:
+        """See :meth:`Question.places`: the best first."""
+        return list(permutations(range(n_options)))
+
     def answers(self, n_options: int) -> Answers:
         """See :meth:`Question.answers`. Answers are K! orders, those of ``itertools.permutations``;
         factor f has K-1-f rows."""

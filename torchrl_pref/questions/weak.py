@@ -28,10 +28,16 @@ class Weak(Question):
         InputError: the threshold is not a number above 0 and at most 100.
     """
 
+    prompt = "Which is better, or are they about equal?"
+
     def __init__(self, threshold: float = 1.0) -> None:
         self.threshold = check_positive("threshold", threshold)
         if threshold > LARGEST:
             raise InputError(f"threshold={threshold}: expected at most {LARGEST:g}; lower it")
+
+    def places(self, n_options: int) -> list[tuple[int, ...]]:
+        """See :meth:`Question.places`: about equal is none of the two."""
+        return [(0,), (1,), ()]
 
     def answers(self, n_options: int) -> Answers:
         """See :meth:`Question.answers`. Answers 0 and 1 are the options, 2 is "about equal"."""

@@ -159,7 +159,7 @@ def check_groups(settings: Plain) -> None:
         check_groups(cast(Settings, settings))
 
 
-def use_threads(settings: Settings) -> None:
+def use_threads(settings: Mapping[str, Any]) -> None:
     """Set torch to the number of threads in the settings."""
     import torch
 

@@ -69,7 +69,7 @@ def make(group: str, section: Mapping[str, Any], *given: Any, without: tuple[str
     keys = {key: value for key, value in section.items() if key not in left_out}
     for key in () if own else CODE.get(group, ()):
         if keys.get(key) is not None:
-            keys[key] = _load_typed(f"{group}.{key}", keys[key])
+            keys[key] = load_typed(f"{group}.{key}", keys[key])
     try:
         inspect.signature(constructor).bind(*given, **keys)
     except TypeError as error:
@@ -103,10 +103,10 @@ def find(group: str, section: Mapping[str, Any]) -> Callable[..., Any]:
     if section["name"] != OWN:
         table = TABLES[group]
         return table[check_choice(group, section["name"], tuple(table))]
-    return _load_typed(group, section.get("make"))
+    return load_typed(group, section.get("make"))
 
 
-def _load_typed(key: str, reference: Any) -> Callable[..., Any]:
+def load_typed(key: str, reference: Any) -> Callable[..., Any]:
     """Import what a setting names as ``module:name``, if the user typed it.
 
     Raises:

@@ -180,6 +180,29 @@ class Session(Learned):
             raise InputError(f"answer={answer!r}: expected a list, one for each person")
         self._let_in(Turn(self._asked, self._said(given)))
 
+    def put(self, query: int | Sequence[int], n_offered: int | None = None) -> None:
+        """Ask this question of the pool next, and not the one that the strategy would choose.
+
+        Args:
+            query: its index; for B people one each.
+            n_offered: in a feed, how many offers went by until it; None: as many as before.
+
+        Raises:
+            InputError: there is no such query, or no question left.
+        """
+        if self.n_answered >= self.budget:
+            raise NothingToAsk(f"budget={self.budget}: all questions are answered")
+        self._asked = self._index_of([query] if isinstance(query, int) else list(query))
+        if n_offered is not None:
+            self._n_offered = torch.full_like(
+                self._n_offered, check_count("n_offered", n_offered, 0)
+            )
+
+    @property
+    def n_offered(self) -> int:
+        """In a feed, how many offers went by so far, of the person with the most."""
+        return int(self._n_offered.max())
+
     def undo(self, turn: int = -1) -> None:
         """Take an answer back; its question is asked again. The other answers stay.
 

@@ -164,6 +164,7 @@ SECTIONS = (
     "setup",
     "policy",
     "algorithm",
+    "study",
     *OTHERS,
 )
 
@@ -174,7 +175,7 @@ def check_train_settings(settings: Plain) -> Settings:
     Raises:
         InputError: a key is missing, unknown or out of its range, or two do not go together.
     """
-    _check_keys(settings, TASK | TRAINING | TRAIN_DOOR, OF_TRAINING)
+    check_keys(settings, TASK | TRAINING | TRAIN_DOOR, OF_TRAINING)
     return check_run(settings)
 
 
@@ -185,7 +186,7 @@ def check_run(settings: Plain) -> Settings:
         InputError: a key is missing, unknown or out of its range, or two do not go together.
     """
     own = {key: value for key, value in settings.items() if key not in (*TRAIN_DOOR, "overrides")}
-    _check_keys(own, TASK | TRAINING, OF_TRAINING)
+    check_keys(own, TASK | TRAINING, OF_TRAINING)
     check_together(own)
     setup, policy = own["setup"], own["policy"]
     if setup["name"] == "feed" and policy.get("start") is not None:
@@ -207,7 +208,7 @@ def check_evaluate_settings(settings: Plain) -> Settings:
     groups: Groups = {"setup": SETUPS, **OTHERS}
     if "policy" in settings:
         groups = {**groups, "policy": PRETRAINED}
-    _check_keys(settings, TASK | EVALUATE, groups)
+    check_keys(settings, TASK | EVALUATE, groups)
     check_together(settings)
     if "policy" in settings:
         one_or_more(choice("noisy", "optimal"))("tau", settings["tau"])
@@ -221,8 +222,12 @@ def check_evaluate_settings(settings: Plain) -> Settings:
     return checked
 
 
-def _check_keys(settings: Plain, table: Mapping[str, Check], groups: Groups) -> None:
-    """Hold every key to its check, and the keys to the table and to the chosen groups' own."""
+def check_keys(settings: Plain, table: Mapping[str, Check], groups: Groups) -> None:
+    """Hold every key to its check, and the keys to the table and to the chosen groups' own.
+
+    Raises:
+        InputError: a key is missing, unknown or out of its range.
+    """
     for section in SECTIONS:
         if not isinstance(settings.get(section, {}), dict):
             raise InputError(

@@ -22,15 +22,14 @@ def check_together(settings: Plain) -> None:
     """
     pool, setup, belief = settings["pool"], settings["setup"], settings["belief"]
     _check_demonstrations(settings)
-    _check_belief(settings)
+    check_belief(settings)
     given = [name for name in ("train", "test") if pool[name] is not None]
     if len(given) == 1 and settings.get("checkpoint") is None:
         raise InputError(
             f"pool.{given[0]}={pool[given[0]]} alone: the other pool would be the task's; "
             "expected both pool.train and pool.test of your own, or neither"
         )
-    if settings["question"]["name"] not in OF_ONE:
-        check_count("pool.options", pool["options"], 2)
+    check_options(settings)
     budget = setup["budget"]
     if setup["name"] == "feed":
         if setup["offers"] is not None:
@@ -47,6 +46,16 @@ def check_together(settings: Plain) -> None:
             f"objective=entropy with belief.samples={belief['samples']}: expected at least 4, as "
             "the entropy is told by the third nearest sample; raise belief.samples"
         )
+
+
+def check_options(settings: Plain) -> None:
+    """Refuse queries of one option for a question about several.
+
+    Raises:
+        InputError: there are such.
+    """
+    if settings["question"]["name"] not in OF_ONE:
+        check_count("pool.options", settings["pool"]["options"], 2)
 
 
 def _check_demonstrations(settings: Plain) -> None:
@@ -67,8 +76,12 @@ def _check_demonstrations(settings: Plain) -> None:
         )
 
 
-def _check_belief(settings: Plain) -> None:
-    """Refuse a human whom the belief cannot infer."""
+def check_belief(settings: Plain) -> None:
+    """Refuse a human whom the belief cannot infer.
+
+    Raises:
+        InputError: it cannot.
+    """
     belief = settings["belief"]
     name = belief["name"]
     if name in ("rationality", "laplace") and "optimal" in _taus(settings):

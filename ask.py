@@ -1,0 +1,196 @@
+"""Ask a person which of two trajectories is better; what they say becomes a reward function.
+
+`python ask.py --help` lists the keys. What takes long to import is imported where it is used, so
+that help and refusals come at once.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import hydra
+from omegaconf import DictConfig, OmegaConf
+
+import app
+import typed
+from torchrl_pref import runs
+from torchrl_pref.config.sections import Plain
+from torchrl_pref.config.study import check_ask_settings
+from torchrl_pref.errors import InputError, one_line_errors
+from torchrl_pref.storage.writing import write_text
+
+if TYPE_CHECKING:
+    from torchrl_pref.study.materials import Materials
+    from torchrl_pref.study.study import Study
+
+CONFIG, POOL, LOG = "config.yaml", "pool.pt", "study.db"
+"""The files of a study; with the log it has begun."""
+
+BESIDE_RESUME = ("ui", "participant", "host", "port", "open", "threads")
+"""What may be typed beside ``resume``: it leaves a study what it is."""
+
+ONLY_SIMULATED = ("setup.candidates", "setup.repeats", "setup.on_skip")
+"""Of simulations alone: people see the whole pool, and nothing twice."""
+
+
+@hydra.main(config_path="conf", config_name="ask", version_base="1.3")
+def job(config: DictConfig) -> None:
+    """A new study, one to go on with, or what came out of one."""
+    with one_line_errors():
+        settings = check(typed.plain_settings(config))
+        if settings["export"] is not None:
+            export(Path(settings["export"]))
+        elif settings["resume"] is not None:
+            go_on(Path(settings["resume"]), settings)
+        else:
+            begin(app.output_folder(), settings)
+
+
+def check(settings: Plain) -> Plain:
+    """Refuse what cannot be asked.
+
+    Raises:
+        InputError: a setting is out of range, or was typed where something else decides.
+    """
+    if app.in_sweep():
+        raise InputError("-m: people answer one study at a time; leave -m out")
+    for key in filter(typed.was_typed, ONLY_SIMULATED):
+        raise InputError(
+            f"{key}: people choose from the whole pool, and are asked nothing twice; remove {key}"
+        )
+    checked = check_ask_settings(settings)
+    own = tuple(key.partition(".")[0] for key in typed.typed_code())
+    code = ("strategy",) if ":" in settings["strategy"] else ()
+    if settings["export"] is not None:
+        typed.refuse_other_overrides("export", ("threads", *code), own)
+    elif settings["resume"] is not None:
+        typed.refuse_other_overrides("resume", (*BESIDE_RESUME, *code), own)
+    app.allow_typed(settings)
+    if code and typed.was_typed("strategy"):
+        from torchrl_pref.groups import allow
+
+        allow(settings["strategy"])
+    if settings["ui"] == "browser" and settings["export"] is None:
+        check_installed()
+    return checked
+
+
+def check_installed() -> None:
+    """Refuse to serve a page without what that takes.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    from importlib.util import find_spec
+
+    missing = [name for name in ("starlette", "uvicorn", "markdown_it") if find_spec(name) is None]
+    if missing:
+        raise InputError(
+            f"ui=browser: {', '.join(missing)} is not installed; install it by make ask, or "
+            "pip install -c constraints.txt -e '.[study]', or type ui=terminal"
+        )
+
+
+def begin(folder: Path, settings: Plain) -> None:
+    """A new study, in the folder made for it."""
+    if (folder / LOG).exists() or (folder / CONFIG).exists():
+        raise InputError(
+            f"{folder} holds a study or a run already; go on with a study by: "
+            f"{app.command(app.as_typed('resume', folder))}, or name another folder by "
+            "hydra.run.dir="
+        )
+    from torchrl_pref.study.materials import draw_pool, make_materials
+
+    with runs.claimed(folder):
+        app.use_threads(settings)
+        raw = draw_pool(settings)
+        materials = make_materials(settings, raw)  # or it is refused, before anything is written
+        raw.save(folder / POOL)
+        write_text(folder / CONFIG, OmegaConf.to_yaml(OmegaConf.create(settings)))
+        ask(make_study(folder, materials), settings)
+
+
+def go_on(folder: Path, typed_now: Plain) -> None:
+    """A study that has begun, with its own settings."""
+    settings = load_settings("resume", folder)
+    settings |= {key: typed_now[key] for key in BESIDE_RESUME if typed.was_typed(key)}
+    with runs.claimed(folder):
+        app.use_threads(settings)
+        ask(load_study(folder, settings), settings)
+
+
+def load_settings(key: str, folder: Path) -> Plain:
+    """The settings that a study was begun with.
+
+    Raises:
+        InputError: the folder holds no study, or its settings cannot be read.
+    """
+    if not (folder / LOG).is_file() or not (folder / CONFIG).is_file():
+        raise InputError(
+            f"{key}={folder}: holds no study, with its {LOG} and {CONFIG}; expected the folder "
+            "that ask.py named; check the path"
+        )
+    try:
+        settings = OmegaConf.to_container(OmegaConf.load(folder / CONFIG))
+    except Exception as error:  # whatever the reader trips over, the file is at fault
+        raise InputError(f"{folder / CONFIG}: cannot be read ({error}); restore it") from error
+    if not isinstance(settings, dict):
+        raise InputError(f"{folder / CONFIG}: holds no settings; restore it")
+    return check_ask_settings({str(name): value for name, value in settings.items()})
+
+
+def load_study(folder: Path, settings: Plain) -> Study:
+    """A study from its folder."""
+    from torchrl_pref.pool import QueryPool
+    from torchrl_pref.study.materials import make_materials
+
+    return make_study(folder, make_materials(settings, QueryPool.load(folder / POOL)))
+
+
+def make_study(folder: Path, materials: Materials) -> Study:
+    """A study, with what is worth knowing of it printed."""
+    from torchrl_pref.study.study import Study
+
+    study = Study(folder, materials)
+    for note in study.notes:
+        print(note)
+    return study
+
+
+def ask(study: Study, settings: Plain) -> None:
+    """Let people answer, until somebody stops it; then say what can be done with it."""
+    try:
+        if settings["ui"] == "browser":
+            from torchrl_pref.study.serve import serve
+
+            serve(study, settings["host"], settings["port"], settings["open"])
+        else:
+            from torchrl_pref.study.terminal import converse
+
+            converse(study, settings["participant"])
+    finally:
+        study.close()
+        n_answers = sum(len(person.said) for person in study.people.values())
+        print(f"{n_answers} answers of {len(study.people)} people are in {study.folder}")
+        print(f"go on:  {app.command(app.as_typed('resume', study.folder))}")
+        print(f"export: {app.command(app.as_typed('export', study.folder))}")
+
+
+def export(folder: Path) -> None:
+    """Write what came out of a study."""
+    from torchrl_pref.study.export import export_study
+
+    settings = load_settings("export", folder)
+    with runs.claimed(folder):
+        app.use_threads(settings)
+        study = load_study(folder, settings)
+        try:
+            for path in export_study(study):
+                print(path)
+        finally:
+            study.close()
+
+
+if __name__ == "__main__":
+    app.main(job, check)

@@ -1,0 +1,1 @@
+"""Studies: real people answer, and nothing that they said is ever lost."""

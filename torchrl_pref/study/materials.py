@@ -1,0 +1,123 @@
+"""What a study asks about, and by what: made of its settings.
+
+Shapes: N queries, K options per query, D features.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torchrl_pref.beliefs.base import BeliefBase
+from torchrl_pref.config.sections import Plain
+from torchrl_pref.errors import InputError
+from torchrl_pref.groups import load_typed, make
+from torchrl_pref.pool import Normalizer, QueryPool
+from torchrl_pref.problem import solve_tau
+from torchrl_pref.questions.base import Question
+from torchrl_pref.questions.response_model import ResponseModel
+from torchrl_pref.questions.responses import model_of
+from torchrl_pref.session import Session
+from torchrl_pref.strategies import MakeStrategy
+from torchrl_pref.tasks.base import Task, feature_bars, make_pool
+from torchrl_pref.tasks.scene import Scene
+
+
+@dataclass(frozen=True)
+class Materials:
+    """What a study asks about, and by what.
+
+    Attributes:
+        settings: as typed.
+        raw: the queries, not normalised.
+        pool: the same, normalised.
+        normalizer: by what.
+        question: what can be answered.
+        response_model: how people are thought to answer.
+        strategy: what chooses the questions.
+        task: draws trajectories; None where the pool has none.
+    """
+
+    settings: Plain
+    raw: QueryPool
+    pool: QueryPool
+    normalizer: Normalizer
+    question: Question
+    response_model: ResponseModel
+    strategy: str | MakeStrategy
+    task: Task | None
+
+    def session(self, seed: int) -> Session:
+        """A session of one person, from the start."""
+        setup = self.settings["setup"]
+        return Session(
+            self.pool,
+            self.response_model,
+            self.strategy,
+            self._belief(),
+            budget=setup["budget"],
+            normalizer=self.normalizer,
+            seed=seed,
+            setup=setup["name"],
+            offers=setup.get("offers"),
+        )
+
+    def _belief(self) -> BeliefBase:
+        section = self.settings["belief"]
+        made: BeliefBase = make("belief", section, self.response_model, without=("lapse",))
+        return made
+
+    def scene(self, query: int, option: int) -> Scene:
+        """What a person is shown of an option of the pool."""
+        if self.task is None or self.raw.trajectories is None:
+            own = self.raw.features[query, option]
+            sizes = self.pool.features[query, option].clamp(-3, 3)
+            return feature_bars(self.raw.feature_names, own, sizes)
+        return self.task.scene(self.raw.trajectories[query, option])
+
+
+def draw_pool(settings: Plain) -> QueryPool:
+    """The queries of a new study, not normalised: of its file, or drawn from its task.
+
+    Raises:
+        InputError: they cannot be had.
+    """
+    pool = settings["pool"]
+    if pool["file"] is not None:
+        return QueryPool.load(pool["file"])
+    return make_pool(make("task", settings["task"]), pool["size"], pool["options"], pool["seed"])
+
+
+def make_materials(settings: Plain, raw: QueryPool) -> Materials:
+    """Everything that a study needs, from its settings and its queries.
+
+    Raises:
+        InputError: a setting cannot be used.
+    """
+    normalizer = Normalizer.fit(raw.features, raw.feature_names)
+    pool = raw.map_features(normalizer)
+    question: Question = make("question", settings["question"])
+    tau = solve_tau(settings["tau"], pool)
+    model = model_of(tau, question, settings["belief"]["lapse"])
+    model.n_answers(pool.n_options)  # or it is refused here
+    task = None if settings["pool"]["file"] is not None else make("task", settings["task"])
+    named = settings["strategy"]
+    strategy = load_typed("strategy", named) if ":" in named else named
+    made = Materials(settings, raw, pool, normalizer, question, model, strategy, task)
+    if task is not None:
+        _try_scene(made)
+    made.session(0)  # or it is refused here
+    return made
+
+
+def _try_scene(materials: Materials) -> None:
+    """Refuse a task that cannot draw.
+
+    Raises:
+        InputError: it cannot.
+    """
+    scene = materials.scene(0, 0)
+    if not isinstance(scene, Scene) or not scene.frames:
+        raise InputError(
+            f"task={materials.settings['task']['name']}: draws nothing of a trajectory; expected a "
+            "Scene with at least one frame from its method scene"
+        )

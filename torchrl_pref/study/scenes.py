@@ -1,0 +1,60 @@
+"""Scenes as plain JSON, for a page to draw.
+
+Letters: K options of a question.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+from torchrl_pref.tasks.scene import Picture, Scene, Shape
+
+DIGITS = 5
+"""Of a coordinate: more than a screen can show."""
+
+
+class Pictures:
+    """The image files that the scenes of a study show, by number: nobody can ask for another."""
+
+    def __init__(self) -> None:
+        self._paths: list[str] = []
+        self._numbers: dict[str, int] = {}
+
+    def number(self, path: str) -> int:
+        """The number of an image file."""
+        if path not in self._numbers:
+            self._numbers[path] = len(self._paths)
+            self._paths.append(path)
+        return self._numbers[path]
+
+    def path(self, number: int) -> str | None:
+        """The file of a number; None where there is none."""
+        return self._paths[number] if 0 <= number < len(self._paths) else None
+
+
+def scene_as_json(scene: Scene, pictures: Pictures) -> dict[str, Any]:
+    """What a page draws of a trajectory: the fields of the scene, each shape with its kind."""
+    return {
+        "low": _rounded(scene.low),
+        "high": _rounded(scene.high),
+        "equal": scene.equal,
+        "still": [_shape(shape, pictures) for shape in scene.still],
+        "frames": [[_shape(shape, pictures) for shape in frame] for frame in scene.frames],
+    }
+
+
+def _shape(shape: Shape, pictures: Pictures) -> dict[str, Any]:
+    kind = type(shape).__name__.lower()
+    if isinstance(shape, Picture):
+        return {"kind": kind, "url": f"/api/picture/{pictures.number(shape.path)}"}
+    return {"kind": kind, **{key: _rounded(value) for key, value in asdict(shape).items()}}
+
+
+def _rounded(value: Any) -> Any:
+    """Numbers of few digits, in lists of any depth; anything else as it is."""
+    if isinstance(value, tuple | list):
+        return [_rounded(one) for one in value]
+    if isinstance(value, float):
+        return float(f"{value:.{DIGITS}g}")
+    return value

@@ -1,0 +1,155 @@
+"""A study: its participants, its log, and what they have in common.
+
+One thing happens at a time: whoever asks or answers has the study's turn. In between it thinks
+ahead of what the people there may answer.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from torchrl_pref.config.study import CODE
+from torchrl_pref.errors import InputError
+from torchrl_pref.study.instructions import read_instructions
+from torchrl_pref.study.log import Event, Log
+from torchrl_pref.study.materials import Materials
+from torchrl_pref.study.participant import Participant
+from torchrl_pref.study.scenes import Pictures
+from torchrl_pref.study.state import state_of
+
+LOG = "study.db"
+"""The log of a study, in its folder."""
+
+MOST_PARTICIPANTS = 1000
+
+
+def versions() -> dict[str, str]:
+    """Of what a belief depends on, to the last bit."""
+    return {name: version(name) for name in ("torchrl_pref", "torch", "numba")}
+
+
+class Study:
+    """A study that goes on.
+
+    Args:
+        folder: of the study; a new log is begun there where there is none.
+        materials: what it asks about.
+
+    Attributes:
+        people: participants by their codes, in the order in which they came.
+        pictures: the image files that its scenes show.
+        notes: what is worth knowing of how it goes on, a sentence each.
+
+    Raises:
+        InputError: the log is of another study, or cannot be used.
+    """
+
+    def __init__(self, folder: Path, materials: Materials) -> None:
+        self.folder, self.materials, self.pictures = folder, materials, Pictures()
+        settings = materials.settings["study"]
+        named = settings["instructions"]
+        self.instructions = [] if named is None else read_instructions(named)
+        self.log = Log(folder / LOG)
+        self.people: dict[str, Participant] = {}
+        self._common = {
+            "study_seed": materials.settings["seed"],
+            "pool": materials.pool.digest,
+            "versions": versions(),
+        }
+        self._lock, self._counting, self._in_line = threading.Lock(), threading.Lock(), 0
+        self._to_think: queue.SimpleQueue[Participant | None] = queue.SimpleQueue()
+        self._thinker: threading.Thread | None = None
+        self.notes = self._replay(self.log.events())
+
+    def _replay(self, events: list[Event]) -> list[str]:
+        """Let in what happened before; what is worth knowing of it."""
+        if not events:
+            self.log.append("", "study", self._common)
+            return []
+        first = events[0].content
+        if first.get("pool") != self._common["pool"]:
+            raise InputError(
+                f"{self.log.path}: people were asked about another pool; restore the pool file of "
+                "the study"
+            )
+        by_person: dict[str, list[Event]] = {}
+        for event in events[1:]:
+            by_person.setdefault(event.participant, []).append(event)
+        for code, own in by_person.items():
+            person = Participant(code, self.materials, self.log, self._common)
+            person.replay(own)
+            self.people[code] = person
+        other = [
+            f"{name} {was} then and {versions()[name]} now"
+            for name, was in first.get("versions", {}).items()
+            if was != versions().get(name)
+        ]
+        if not other:
+            return []
+        return [f"note: {', '.join(other)}; a belief may differ in its last digits"]
+
+    @contextmanager
+    def turn(self) -> Iterator[None]:
+        """While the block lasts nobody else does anything, and nothing is thought ahead."""
+        with self._counting:
+            self._in_line += 1
+        try:
+            with self._lock:
+                yield
+        finally:
+            with self._counting:
+                self._in_line -= 1
+
+    def join(self, code: str) -> Participant | None:
+        """The participant of a code, who may be new; None where nobody may be called that.
+
+        Raises:
+            LogError: it cannot be written.
+        """
+        if code not in self.people:
+            named = self.materials.settings["study"]["participants"]
+            if not CODE.fullmatch(code) or (named is not None and code not in named):
+                return None
+            if len(self.people) >= MOST_PARTICIPANTS:
+                return None
+            person = Participant(code, self.materials, self.log, self._common)
+            self.log.append(code, "joined", self._common, f"{code} joined")
+            self.people[code] = person
+        self.people[code].go_to_next()
+        return self.people[code]
+
+    def state(self, person: Participant) -> dict[str, Any]:
+        """What a page shows of a participant; from now on their answers are thought ahead."""
+        state = state_of(person, self.materials, self.pictures)
+        self._to_think.put(person)
+        return state
+
+    def think_ahead(self) -> None:
+        """From now on think of what follows the answers, in a thread of its own."""
+        self._thinker = threading.Thread(target=self._think, daemon=True)
+        self._thinker.start()
+
+    def _think(self) -> None:
+        """Of whoever was shown something, until there is nothing more to think of."""
+        while (person := self._to_think.get()) is not None:
+            more = True
+            while more:
+                while self._in_line:  # people first
+                    time.sleep(0.001)
+                with self._lock:
+                    more = person.foresee()
+
+    def close(self) -> None:
+        """End what is thought ahead, and let the log go."""
+        if self._thinker is not None:
+            self._to_think.put(None)
+            self._thinker.join()
+        with self.turn():
+            self.log.close()

@@ -182,14 +182,13 @@ def export(folder: Path) -> None:
     from torchrl_pref.study.export import export_study
 
     settings = load_settings("export", folder)
-    with runs.claimed(folder):
-        app.use_threads(settings)
-        study = load_study(folder, settings)
-        try:
-            for path in export_study(study):
-                print(path)
-        finally:
-            study.close()
+    app.use_threads(settings)
+    study = load_study(folder, settings)  # people may go on answering meanwhile
+    try:
+        for path in export_study(study):
+            print(path)
+    finally:
+        study.close()
 
 
 if __name__ == "__main__":

@@ -5,7 +5,6 @@ Letters: K options of a question.
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from typing import Any
 
 from torchrl_pref.tasks.scene import Picture, Scene, Shape
@@ -48,7 +47,7 @@ def _shape(shape: Shape, pictures: Pictures) -> dict[str, Any]:
     kind = type(shape).__name__.lower()
     if isinstance(shape, Picture):
         return {"kind": kind, "url": f"/api/picture/{pictures.number(shape.path)}"}
-    return {"kind": kind, **{key: _rounded(value) for key, value in asdict(shape).items()}}
+    return {"kind": kind, **{key: _rounded(value) for key, value in vars(shape).items()}}
 
 
 def _rounded(value: Any) -> Any:

@@ -10,11 +10,12 @@ import queue
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from torchrl_pref.asking import NothingToAsk
 from torchrl_pref.config.study import CODE
 from torchrl_pref.errors import InputError
 from torchrl_pref.study.instructions import read_instructions
@@ -122,17 +123,29 @@ class Study:
             person = Participant(code, self.materials, self.log, self._common)
             self.log.append(code, "joined", self._common, f"{code} joined")
             self.people[code] = person
-        self.people[code].go_to_next()
         return self.people[code]
 
     def state(self, person: Participant) -> dict[str, Any]:
-        """What a page shows of a participant; from now on their answers are thought ahead."""
+        """What a page shows of a participant; from now on their answers are thought ahead.
+
+        Raises:
+            LogError: the next question could not be written down yet.
+        """
+        person.go_to_next()
         state = state_of(person, self.materials, self.pictures)
         self._to_think.put(person)
         return state
 
     def think_ahead(self) -> None:
-        """From now on think of what follows the answers, in a thread of its own."""
+        """From now on think of what follows the answers, in a thread of its own.
+
+        What is slow once only, as compiling, is done before.
+        """
+        session = self.materials.session(0)
+        for _ in range(min(2, session.budget)):
+            with suppress(NothingToAsk):
+                session.ask()
+                session.tell(0)
         self._thinker = threading.Thread(target=self._think, daemon=True)
         self._thinker.start()
 

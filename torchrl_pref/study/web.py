@@ -151,14 +151,15 @@ def _endpoint(study: Study, token: str | None, handler: Handler) -> Callable[[Re
     def work(said: dict[str, Any]) -> Response:
         with study.turn():
             try:
-                result = handler(study, said)
+                try:
+                    result = handler(study, said)
+                except Refused as error:
+                    state = None if error.person is None else study.state(error.person)
+                    return _sentence(error.status, str(error), state)
+                if isinstance(result, Participant):
+                    result = study.state(result)
             except LogError as error:
                 return _sentence(503, str(error))
-            except Refused as error:
-                state = None if error.person is None else study.state(error.person)
-                return _sentence(error.status, str(error), state)
-            if isinstance(result, Participant):
-                result = study.state(result)
             return result if isinstance(result, Response) else JSONResponse(result)
 
     async def endpoint(request: Request) -> Response:
@@ -208,7 +209,7 @@ def _field(said: dict[str, Any], name: str, kinds: tuple[type, ...]) -> Any:
         Refused: it is missing, or of another type.
     """
     value = said.get(name)
-    if type(value) not in kinds:
+    if name not in said or type(value) not in kinds:
         raise Refused(400, f"The request lacks its {name}.")
     return value
 

@@ -1,6 +1,6 @@
 PYTHON ?= python3
 
-.PHONY: install train test lint docs-figures
+.PHONY: install train ask test lint docs-figures
 
 install: .venv/installed
 
@@ -12,6 +12,10 @@ install: .venv/installed
 train: ARGS ?= setup=feed tau=noisy
 train: install
 	.venv/bin/python train.py $(ARGS)
+
+# Options of ask.py: make ask ARGS="task=driver"
+ask: install
+	.venv/bin/python ask.py $(ARGS)
 
 test: install
 	.venv/bin/python -m pytest -n auto

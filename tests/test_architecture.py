@@ -34,6 +34,7 @@ ORDER = [
     "saved_session",
     "asking",
     "session",
+    "study",
     "sweeps",
 ]
 """Folders and modules of the package, from the ground up: each may use those before it."""

@@ -220,7 +220,7 @@ def test_checks_are_spread_and_tell_the_belief_nothing(tmp_path: Path) -> None:
         REPEAT: 3,
         ATTENTION: 2,
     }
-    assert len(person.said) == person.n_questions == 15
+    assert len(person.said) == study.materials.n_questions == 15
     assert person.session.n_answered == 10
     assert [one.passed for one in person.said if one.shown.purpose == ATTENTION] == [True, True]
     first = {one.shown.key: one for one in person.said}

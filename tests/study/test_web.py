@@ -46,6 +46,7 @@ def test_a_person_answers_and_sees_what_was_learned(study: Study, client: TestCl
         "title": "Which do you like better?",
         "instructions": [],
         "consent": False,
+        "questions": 6,
         "participants": "open",
     }
     state = joined(client)

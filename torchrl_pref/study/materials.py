@@ -46,6 +46,13 @@ class Materials:
     strategy: str | MakeStrategy
     task: Task | None
 
+    @property
+    def n_questions(self) -> int:
+        """How many a person is shown at most, checks among them."""
+        checks = self.settings["study"]
+        budget: int = self.settings["setup"]["budget"]
+        return budget + checks["attention"] + checks["repeats"]
+
     def session(self, seed: int) -> Session:
         """A session of one person, from the start."""
         setup = self.settings["setup"]

@@ -117,12 +117,6 @@ class Participant:
         self.foreseen: dict[int | None, Session] = {}
         self._waiting: list[Shown] = []
 
-    @property
-    def n_questions(self) -> int:
-        """How many they are going to be shown at most, checks among them."""
-        checks = self._materials.settings["study"]
-        return self.session.budget + checks["attention"] + checks["repeats"]
-
     def replay(self, events: list[Event]) -> None:
         """Let in what happened before.
 

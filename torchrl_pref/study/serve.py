@@ -35,6 +35,7 @@ def serve(study: Study, host: str, port: int, open_page: bool) -> None:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             listening.bind((host, port))
+            listening.listen()  # so that who follows the link at once waits, and is not refused
         except OSError as error:
             raise InputError(
                 f"host={host} port={port}: cannot be served there ({error.strerror or error}); "

@@ -26,7 +26,7 @@ def state_of(person: Participant, materials: Materials, pictures: Pictures) -> d
         "phase": "end" if person.shown is None else "question",
         "code": person.code,
         "answered": len(person.said),
-        "budget": person.n_questions,
+        "budget": materials.n_questions,
         "question": None if person.shown is None else _question(person, materials, pictures),
         "learned": _learned(person, materials, pictures, doubtful),
         "answers": [

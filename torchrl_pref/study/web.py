@@ -232,6 +232,7 @@ def _about(study: Study, said: dict[str, Any]) -> dict[str, Any]:
         "title": settings["title"],
         "instructions": study.instructions,
         "consent": settings["consent"],
+        "questions": study.materials.n_questions,
         "participants": "open" if settings["participants"] is None else "named",
     }
 

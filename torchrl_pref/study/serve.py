@@ -56,6 +56,7 @@ def serve(study: Study, host: str, port: int, open_page: bool) -> None:
         config = uvicorn.Config(
             make_app(study, hosts if local else (), token),
             log_level="warning",
+            lifespan="off",
             server_header=False,
             limit_concurrency=200,
             timeout_graceful_shutdown=3,

@@ -6,6 +6,9 @@ that help and refusals come at once.
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,7 +19,7 @@ import app
 import typed
 from torchrl_pref import runs
 from torchrl_pref.config.sections import Plain
-from torchrl_pref.config.study import check_ask_settings
+from torchrl_pref.config.study import ONLY_SIMULATED, check_ask_settings
 from torchrl_pref.errors import InputError, one_line_errors
 from torchrl_pref.storage.writing import write_text
 
@@ -29,9 +32,6 @@ CONFIG, POOL, LOG = "config.yaml", "pool.pt", "study.db"
 
 BESIDE_RESUME = ("ui", "participant", "host", "port", "open", "threads")
 """What may be typed beside ``resume``: it leaves a study what it is."""
-
-ONLY_SIMULATED = ("setup.candidates", "setup.repeats", "setup.on_skip")
-"""Of simulations alone: people see the whole pool, and nothing twice."""
 
 
 @hydra.main(config_path="conf", config_name="ask", version_base="1.3")
@@ -53,8 +53,6 @@ def check(settings: Plain) -> Plain:
     Raises:
         InputError: a setting is out of range, or was typed where something else decides.
     """
-    if app.in_sweep():
-        raise InputError("-m: people answer one study at a time; leave -m out")
     for key in filter(typed.was_typed, ONLY_SIMULATED):
         raise InputError(
             f"{key}: people choose from the whole pool, and are asked nothing twice; remove {key}"
@@ -102,22 +100,22 @@ def begin(folder: Path, settings: Plain) -> None:
         )
     from torchrl_pref.study.materials import draw_pool, make_materials
 
-    with runs.claimed(folder):
+    with runs.claimed(folder), way_to_ask(settings) as ask:
         app.use_threads(settings)
         raw = draw_pool(settings)
         materials = make_materials(settings, raw)  # or it is refused, before anything is written
         raw.save(folder / POOL)
         write_text(folder / CONFIG, OmegaConf.to_yaml(OmegaConf.create(settings)))
-        ask(make_study(folder, materials), settings)
+        run(make_study(folder, materials), ask)
 
 
 def go_on(folder: Path, typed_now: Plain) -> None:
     """A study that has begun, with its own settings."""
     settings = load_settings("resume", folder)
     settings |= {key: typed_now[key] for key in BESIDE_RESUME if typed.was_typed(key)}
-    with runs.claimed(folder):
+    with runs.claimed(folder), way_to_ask(settings) as ask:
         app.use_threads(settings)
-        ask(load_study(folder, settings), settings)
+        run(load_study(folder, settings), ask)
 
 
 def load_settings(key: str, folder: Path) -> Plain:
@@ -158,17 +156,29 @@ def make_study(folder: Path, materials: Materials) -> Study:
     return study
 
 
-def ask(study: Study, settings: Plain) -> None:
-    """Let people answer, until somebody stops it; then say what can be done with it."""
+@contextmanager
+def way_to_ask(settings: Plain) -> Iterator[Callable[[Study], None]]:
+    """What asks people, until somebody stops it.
+
+    Raises:
+        InputError: nothing can be served at that address.
+    """
+    if settings["ui"] == "terminal":
+        from torchrl_pref.study.terminal import converse
+
+        yield lambda study: converse(study, settings["participant"])
+        return
+    from torchrl_pref.study.serve import listening_at, serve
+
+    host = settings["host"]
+    with listening_at(host, settings["port"]) as listening:
+        yield lambda study: serve(study, listening, host, settings["open"])
+
+
+def run(study: Study, ask: Callable[[Study], None]) -> None:
+    """Let people answer; then say what can be done with that."""
     try:
-        if settings["ui"] == "browser":
-            from torchrl_pref.study.serve import serve
-
-            serve(study, settings["host"], settings["port"], settings["open"])
-        else:
-            from torchrl_pref.study.terminal import converse
-
-            converse(study, settings["participant"])
+        ask(study)
     finally:
         study.close()
         n_answers = sum(len(person.said) for person in study.people.values())
@@ -191,5 +201,13 @@ def export(folder: Path) -> None:
         study.close()
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Run what was typed."""
+    with one_line_errors():
+        if {"-m", "--multirun"} & set(sys.argv):
+            raise InputError("-m: people answer one study at a time; leave -m out")
     app.main(job, check)
+
+
+if __name__ == "__main__":
+    main()

@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+from torchrl_pref.config.study import ONLY_SIMULATED
+
 CONF = Path(__file__).parent / "conf"
 
 WIDTH, COLUMN = 100, 28
@@ -28,14 +30,18 @@ class Key(NamedTuple):
 
 
 def help_text(script: str) -> str:
-    """The help of ``train`` or ``evaluate``."""
+    """The help of a script, by its name without ``.py``."""
     own = CONF / f"{script}.yaml"
     keys = keys_of(own)
-    names = {key.name for key in keys}
-    common = [key for key in keys_of(CONF / "common.yaml") if key.name not in names]
-    parts = [_top_comment(own), "Keys, with their defaults:", _table(common), _table(keys)]
+    said = {key.name for key in keys}  # here, or nowhere
+    parts = [_top_comment(own), "Keys, with their defaults:"]
+    if "  - common\n" in own.read_text():
+        parts.append(_table([key for key in keys_of(CONF / "common.yaml") if key.name not in said]))
+    parts.append(_table(keys))
+    if script == "ask":
+        said |= set(ONLY_SIMULATED)
     for group, default in _groups(own):
-        parts.append(_group(group, default, script))
+        parts.append(_group(group, default, script, said))
     parts.append(_table([Key("hydra.run.dir", "<folder>", "where the results go")]))
     return "\n\n".join(part for part in parts if part) + "\n"
 
@@ -66,8 +72,8 @@ def _groups(path: Path) -> Iterator[tuple[str, str]]:
     yield from re.findall(r"^  - (\w+): (\w+)$", path.read_text(), re.M)
 
 
-def _group(group: str, default: str, script: str) -> str:
-    """All that a group can choose, each with its keys."""
+def _group(group: str, default: str, script: str, said: set[str]) -> str:
+    """All that a group can choose, each with its keys but for those that are said elsewhere."""
     rows = []
     paths = sorted((CONF / group).glob("*.yaml"), key=lambda path: (path.stem != default, path))
     for path in paths:
@@ -79,7 +85,11 @@ def _group(group: str, default: str, script: str) -> str:
         mark = " (default)" if path.stem == default else ""
         rows.append(_row(f"{group}={path.stem}", f"{meaning}{mark}"))
         inner = [key for key in keys if named and key.name != "name" and key.value != "???"]
-        rows += [_row(f"  {group}.{key.name}={key.value}", key.comment) for key in inner]
+        rows += [
+            _row(f"  {group}.{key.name}={key.value}", key.comment)
+            for key in inner
+            if f"{group}.{key.name}" not in said
+        ]
     return "\n".join(rows)
 
 

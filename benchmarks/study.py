@@ -96,6 +96,7 @@ def be_server(log: str, arguments: tuple[str, ...]) -> None:
     os.dup2(out, 1)
     os.dup2(out, 2)
     sys.stdout, sys.stderr = (os.fdopen(number, "w", buffering=1) for number in (1, 2))
+    os.chdir(tempfile.gettempdir())
     sys.argv = [str(ROOT / "ask.py"), *arguments, "open=false"]
     sys.path[0] = str(ROOT)
     runpy.run_path(sys.argv[0], run_name="__main__")

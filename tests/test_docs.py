@@ -20,6 +20,7 @@ from test_cli import keys_of
 import typed
 from benchmarks import docs_figures
 from torchrl_pref.config.settings import check_evaluate_settings, check_train_settings
+from torchrl_pref.config.study import check_ask_settings
 from torchrl_pref.evaluation.records import Entry, Records
 from torchrl_pref.humans import HUMANS
 from torchrl_pref.tasks import TASKS
@@ -77,12 +78,12 @@ def test_modules_that_are_named_exist(page: Path) -> None:
 
 
 def commands_in(page: Path) -> set[str]:
-    """The command lines of train.py and evaluate.py on a page."""
+    """The command lines of our scripts on a page."""
     blocks = (code.splitlines() for _, _, code in FENCE.findall(page.read_text()))
     lines = [*chain(*blocks), *INLINE.findall(prose(page))]
-    made = re.findall(r'make train ARGS="([^"]+)"', "\n".join(lines))
-    found = re.findall(r"^\S*python ((?:train|evaluate)\.py\b.*)", "\n".join(lines), re.M)
-    return {*found, *(f"train.py {arguments}" for arguments in made)}
+    made = re.findall(r'make (train|ask) ARGS="([^"]+)"', "\n".join(lines))
+    found = re.findall(r"^\S*python ((?:train|evaluate|ask)\.py\b.*)", "\n".join(lines), re.M)
+    return {*found, *(f"{script}.py {arguments}" for script, arguments in made)}
 
 
 COMMANDS = [(page, line) for page in PAGES for line in sorted(commands_in(page))]
@@ -105,13 +106,20 @@ def jobs_of(arguments: list[str]) -> list[list[str]]:
 def test_commands_are_accepted(page: Path, line: str) -> None:
     """As far as settings alone can tell; any file stands for a run or a pool that is not there."""
     script, *arguments = shlex.split(re.sub(r"<[^>]*>", "x", line), comments=True)
-    files = r"^(checkpoint|resume|pool\.train|pool\.test)=.*"
+    files = r"^(checkpoint|resume|export|pool\.(?:train|test|file))=.*"
     arguments = [re.sub(files, rf"\1='{CARD}'", argument) for argument in arguments]
     if "--help" in arguments:
         return
     for job in jobs_of([one for one in typed.told_hydra(arguments) if one != "-m"]):
-        check = check_train_settings if script == "train.py" else check_evaluate_settings
-        check(composed(script.removesuffix(".py"), *job))
+        name = script.removesuffix(".py")
+        CHECKS[name](composed(name, *job))
+
+
+CHECKS = {
+    "train": check_train_settings,
+    "evaluate": check_evaluate_settings,
+    "ask": check_ask_settings,
+}
 
 
 NO_SETTINGS = ("actor", "csv", "png", "py", "strategy")
@@ -120,13 +128,13 @@ NO_SETTINGS = ("actor", "csv", "png", "py", "strategy")
 
 @functools.cache
 def known_keys() -> set[str]:
-    """Every key that either script has, whatever is chosen."""
+    """Every key that a script has, whatever is chosen."""
     groups = ("setup=query", "setup=feed", "question=weak", "belief=rationality")
     groups += ("policy=attention", "policy=scorer")
     tasks = ("task=lds", "task=gymnasium", "task=torchrl", "task=files", "task=minari")
     humans = [f"human={name}" for name in HUMANS]
     typed_here = [("train", one) for one in (*groups, *tasks, *humans, "algorithm=ppo")]
-    typed_here += [("evaluate", one) for one in groups[:4]]
+    typed_here += [(script, one) for script in ("evaluate", "ask") for one in groups[:4]]
     keys = set(chain(*(keys_of(OmegaConf.create(composed(*one))) for one in typed_here)))
     return keys | {key.partition(".")[0] for key in keys} | {"experiment"}
 

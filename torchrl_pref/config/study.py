@@ -106,6 +106,9 @@ KEYS: dict[str, Check] = {
     "belief.lapse": check_share,
 }
 
+ONLY_SIMULATED = ("setup.candidates", "setup.repeats", "setup.on_skip")
+"""Of simulations alone: people see the whole pool, and nothing twice."""
+
 SETUPS: dict[str, dict[str, Check]] = {
     "query": {
         "setup.budget": count(1, MOST_QUESTIONS),
@@ -118,7 +121,7 @@ SETUPS: dict[str, dict[str, Check]] = {
         "setup.on_skip": lambda name, value: None,
     },
 }
-"""What is not checked is of simulations alone: people see the whole pool, and nothing twice."""
+"""By setup; what is not checked is of simulations alone."""
 
 
 def check_ask_settings(settings: Plain) -> Plain:

@@ -8,6 +8,8 @@ import secrets
 import socket
 import sys
 import webbrowser
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import uvicorn
 
@@ -16,15 +18,13 @@ from torchrl_pref.study.study import Study
 from torchrl_pref.study.web import make_app
 
 
-def serve(study: Study, host: str, port: int, open_page: bool) -> None:
-    """Serve a study until Ctrl-C or SIGTERM.
+@contextmanager
+def listening_at(host: str, port: int) -> Iterator[socket.socket]:
+    """A socket to serve a study at, for the length of the block.
 
     Args:
-        study: what people answer.
-        host: an address of this machine; any but its loopback is reached from outside, and then the
-            link has a token.
+        host: an address of this machine.
         port: of the page; 0 is any that is free.
-        open_page: whether to open it, where there is a display.
 
     Raises:
         InputError: nothing can be served there.
@@ -41,27 +41,39 @@ def serve(study: Study, host: str, port: int, open_page: bool) -> None:
                 f"host={host} port={port}: cannot be served there ({error.strerror or error}); "
                 "type another port, or port=0 for any that is free"
             ) from None
-        port = listening.getsockname()[1]
-        local = is_loopback(host)
-        token = None if local else secrets.token_urlsafe(24)
-        hosts = tuple(f"{name}:{port}" for name in ("127.0.0.1", "localhost", "[::1]"))
-        link = f"http://{_in_link(host)}:{port}/" + ("" if token is None else f"#token={token}")
-        print(f"the study is at {link}", flush=True)
-        if not local:
-            print("whoever has this link can take part: hand it to the participants alone")
-        print("Ctrl-C ends it; it can be gone on with", flush=True)
-        if open_page and has_display():
-            webbrowser.open(link)
-        study.think_ahead()
-        config = uvicorn.Config(
-            make_app(study, hosts if local else (), token),
-            log_level="warning",
-            lifespan="off",
-            server_header=False,
-            limit_concurrency=200,
-            timeout_graceful_shutdown=3,
-        )
-        uvicorn.Server(config).run([listening])
+        yield listening
+
+
+def serve(study: Study, listening: socket.socket, host: str, open_page: bool) -> None:
+    """Serve a study until Ctrl-C or SIGTERM.
+
+    Args:
+        study: what people answer.
+        listening: where, see :func:`listening_at`.
+        host: the address; any but this machine's loopback is reached from outside, and then the
+            link has a token.
+        open_page: whether to open the page, where there is a display.
+    """
+    port, local = listening.getsockname()[1], is_loopback(host)
+    token = None if local else secrets.token_urlsafe(24)
+    hosts = tuple(f"{name}:{port}" for name in ("127.0.0.1", "localhost", "[::1]"))
+    link = f"http://{_in_link(host)}:{port}/" + ("" if token is None else f"#token={token}")
+    print(f"the study is at {link}", flush=True)
+    if not local:
+        print("whoever has this link can take part: hand it to the participants alone")
+    print("Ctrl-C ends it; it can be gone on with", flush=True)
+    if open_page and has_display():
+        webbrowser.open(link)
+    study.think_ahead()
+    config = uvicorn.Config(
+        make_app(study, hosts if local else (), token),
+        log_level="warning",
+        lifespan="off",
+        server_header=False,
+        limit_concurrency=200,
+        timeout_graceful_shutdown=3,
+    )
+    uvicorn.Server(config).run([listening])
 
 
 def is_loopback(host: str) -> bool:

@@ -140,10 +140,15 @@ def load_settings(key: str, folder: Path) -> Plain:
 
 def load_study(folder: Path, settings: Plain) -> Study:
     """A study from its folder."""
+    return make_study(folder, load_materials(folder, settings))
+
+
+def load_materials(folder: Path, settings: Plain) -> Materials:
+    """What a study asks about, from its folder."""
     from torchrl_pref.pool import QueryPool
     from torchrl_pref.study.materials import make_materials
 
-    return make_study(folder, make_materials(settings, QueryPool.load(folder / POOL)))
+    return make_materials(settings, QueryPool.load(folder / POOL))
 
 
 def make_study(folder: Path, materials: Materials) -> Study:

@@ -4,8 +4,7 @@ Scripted people answer over HTTP while the server is killed by ``kill -9`` at ra
 started again by ``resume=``. They do what the page does: an answer without a reply is sent again
 under the same key. At the end the log is held against what they know of: each answer that was
 acknowledged is there once, to the question that it was given to, and the log replays to the belief
-that the server showed. With ``--times`` the time from an answer to the next question is measured
-instead. The exit status is 1 where anything is otherwise.
+that the server showed. The exit status is 1 where anything is otherwise.
 """
 
 from __future__ import annotations
@@ -17,89 +16,16 @@ ROOT = Path(__file__).parent.parent
 sys.path[0] = str(ROOT)  # and not this folder, whose select.py would hide Python's own
 
 import argparse
-import http.client
-import json
-import multiprocessing
-import os
 import random
-import re
-import runpy
-import signal
-import statistics
 import tempfile
 import threading
-import time
 from contextlib import suppress
 from typing import Any
 
 from tabulate import tabulate
 from tqdm import tqdm
 
-CONTEXT = multiprocessing.get_context("forkserver")
-CONTEXT.set_forkserver_preload(
-    ["hydra", "uvicorn", "torchrl_pref.study.serve", "torchrl_pref.pretrained"]
-)
-
-SLOWEST = 120
-"""Seconds within which a server has to be there, and to reply."""
-
-GONE = (OSError, http.client.HTTPException)
-"""What is raised where the server was killed."""
-
-
-class Server:
-    """``ask.py`` in a process of its own; forked from one that has imported everything."""
-
-    def __init__(self, *arguments: str) -> None:
-        number, name = tempfile.mkstemp(suffix=".log")
-        os.close(number)
-        self.log = Path(name)
-        self.process = CONTEXT.Process(target=be_server, args=(name, arguments), daemon=True)
-        self.process.start()
-        self.port = self._wait_for_port()
-
-    def _wait_for_port(self) -> int:
-        until = time.monotonic() + SLOWEST
-        while time.monotonic() < until and self.process.is_alive():
-            found = re.search(r"http://127\.0\.0\.1:(\d+)/", self.log.read_text())
-            if found:
-                return int(found[1])
-            time.sleep(0.005)
-        raise SystemExit(f"the server did not start: {self.log.read_text()}")
-
-    def kill(self) -> None:
-        """By SIGKILL, which nothing survives."""
-        with suppress(ProcessLookupError):
-            os.kill(self.process.pid or 0, signal.SIGKILL)
-
-    def close(self) -> None:
-        """Kill it, and wait until it is gone."""
-        self.kill()
-        self.process.join()
-        self.log.unlink()
-
-    def post(self, path: str, **body: Any) -> tuple[int, dict[str, Any]]:
-        """Status and JSON of a request."""
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=SLOWEST)
-        try:
-            headers = {"Content-Type": "application/json"}
-            connection.request("POST", path, json.dumps(body), headers)
-            reply = connection.getresponse()
-            return reply.status, json.loads(reply.read())
-        finally:
-            connection.close()
-
-
-def be_server(log: str, arguments: tuple[str, ...]) -> None:
-    """Become ``ask.py``."""
-    out = os.open(log, os.O_WRONLY)
-    os.dup2(out, 1)
-    os.dup2(out, 2)
-    sys.stdout, sys.stderr = (os.fdopen(number, "w", buffering=1) for number in (1, 2))
-    os.chdir(tempfile.gettempdir())
-    sys.argv = [str(ROOT / "ask.py"), *arguments, "open=false"]
-    sys.path[0] = str(ROOT)
-    runpy.run_path(sys.argv[0], run_name="__main__")
+from benchmarks.served import GONE, WATCHED, Server
 
 
 class People:
@@ -201,9 +127,6 @@ class People:
             self.maybe_undone = None
 
 
-WATCHED = {"seconds": 1.0, "replays": 0}
-
-
 def kills(count: int, seed: int) -> bool:
     """Kill the server so often; whether nothing was lost, doubled or moved."""
     luck, people = random.Random(seed), People(seed)
@@ -255,51 +178,13 @@ def report(folder: Path, people: People, count: int) -> bool:
     return not wrong
 
 
-def times(size: int, think: float) -> bool:
-    """Measure the server's part from an answer to the next question."""
-    rows = []
-    for label, typed in (
-        ("policy", ("strategy=policy",)),
-        ("policy, feed", ("strategy=policy", "setup=feed")),
-        ("alignment_gain", ("strategy=alignment_gain",)),
-    ):
-        with tempfile.TemporaryDirectory() as scratch:
-            common = f"hydra.run.dir={scratch}/study", "task=driver", f"pool.size={size}"
-            server = Server(*common, *typed)
-            _, state = server.post("/api/join", code="P1")
-            took = []
-            while state["question"] is not None:
-                time.sleep(think)
-                body = {"key": state["question"]["key"], **WATCHED}
-                begun = time.perf_counter()
-                _, state = server.post(
-                    "/api/answer", code="P1", answer=random.choice([0, 1]), **body
-                )
-                took.append(1000 * (time.perf_counter() - begun))
-            server.close()
-        ordered = sorted(took)
-        rows.append([label, statistics.median(took), ordered[int(0.95 * len(took))], ordered[-1]])
-    heads = ["strategy", "median ms", "95% ms", "most ms"]
-    print(f"from an answer to the next question, Driver, N={size}, answered after {think} s")
-    print(tabulate(rows, heads, floatfmt=".1f"))
-    return True
-
-
 def main() -> None:
     """Run what was typed."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument(
-        "--kills", type=int, default=200, help="how often the server is killed (200)"
-    )
-    parser.add_argument("--seed", type=int, default=0, help="fixes the moments and the person (0)")
-    parser.add_argument("--times", action="store_true", help="measure times instead")
-    parser.add_argument("--size", type=int, default=10_000, help="N, with --times (10000)")
-    parser.add_argument(
-        "--think", type=float, default=1.0, help="seconds of a person, with --times (1)"
-    )
+    parser.add_argument("--kills", type=int, default=200, help="of the server (default 200)")
+    parser.add_argument("--seed", type=int, default=0, help="of the moments and the people")
     typed = parser.parse_args()
-    good = times(typed.size, typed.think) if typed.times else kills(typed.kills, typed.seed)
-    raise SystemExit(0 if good else 1)
+    raise SystemExit(0 if kills(typed.kills, typed.seed) else 1)
 
 
 if __name__ == "__main__":

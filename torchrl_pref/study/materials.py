@@ -53,8 +53,8 @@ class Materials:
         budget: int = self.settings["setup"]["budget"]
         return budget + checks["attention"] + checks["repeats"]
 
-    def session(self, seed: int) -> Session:
-        """A session of one person, from the start."""
+    def session(self, seed: int, people: int | None = None) -> Session:
+        """A session of one person, from the start; or of so many side by side."""
         setup = self.settings["setup"]
         return Session(
             self.pool,
@@ -62,6 +62,7 @@ class Materials:
             self.strategy,
             self._belief(),
             budget=setup["budget"],
+            people=people,
             normalizer=self.normalizer,
             seed=seed,
             setup=setup["name"],

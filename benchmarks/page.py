@@ -168,7 +168,8 @@ def pictures(browser: Browser, scratch: Path, folder: Path) -> None:
         save(browser, folder / f"question-{name}.png")
         for part in browser.find("details:not([open]) summary"):
             part.click()
-        browser.driver.execute_script("document.getElementById('learned').scrollIntoView()")
+        if size == PHONE:
+            browser.driver.execute_script("document.getElementById('learned').scrollIntoView()")
         save(browser, folder / f"progress-{name}.png")
         for number, key in enumerate("bbaabbabbab", 10):
             browser.answer(key, f"Question {number} ")

@@ -12,7 +12,7 @@ export function showLearned(state, undo) {
   const { learned } = state;
   byId("learned").hidden = false;
   byId("learned").replaceChildren(
-    folding("What has been learned so far", "weights", opened, ...weights(learned), ...sure(learned)),
+    folding("What has been learned so far", "weights", opened, ...weights(learned), ...sure(learned, state.phase === "question")),
     folding("The best, as far as is known", "best", opened, ...bestOf(learned)),
     folding(`Your answers (${state.answers.length})`, "answers", opened, answers(state, undo)),
   );
@@ -55,22 +55,29 @@ function interval(mean, low, high) {
   );
 }
 
-function sure({ sureness, history, expected_gain: gain, rationality, doubtful }) {
+function sure({ sureness, history, rationality, doubtful, ...learned }, asks) {
   const percent = Math.round(100 * sureness);
   const said = [
     element("p", { className: "sure" }, "How well you are known: ", element("strong", {}, `${percent} of 100`)),
     curve(history),
-    element("p", {}, gain === null
-      ? "This question checks something else, and adds nothing."
-      : `Your next answer is expected to add ${short(100 * gain, 1)}.`),
   ];
+  if (asks) said.push(element("p", {}, worth(learned.expected_gain)));
   if (rationality !== null) said.push(element("p", {}, careful(rationality)));
   for (const one of doubtful) {
-    said.push(element("p", { className: "doubtful" },
-      `Answer ${one.number} fits badly with the others: it would be given ${one.probability < 0.01
-        ? "less than 1" : Math.round(100 * one.probability)} time in 100. It may be a slip; it can be taken back below.`));
+    said.push(element("p", { className: "doubtful" }, badly(one)));
   }
   return said;
+}
+
+function worth(gain) {
+  if (gain === null) return "This question checks something else, and adds nothing.";
+  return `Your next answer is expected to add ${short(100 * gain, 1)}.`;
+}
+
+function badly({ number, probability }) {
+  const times = Math.round(100 * probability);
+  const often = times < 1 ? "less than once" : times === 1 ? "once" : `${times} times`;
+  return `Answer ${number} fits badly with the others: it would be given ${often} in 100. It may be a slip; it can be taken back below.`;
 }
 
 function careful({ median, low, high }) {

@@ -176,7 +176,7 @@ function showQuestion(question) {
     element("div", { className: "options" }, ...options),
     player.controls, answering.sofar, answering.others, beside(),
   ].filter(Boolean));
-  prompt.focus({ preventScroll: true });
+  prompt.focus();
   byId("spoken").textContent = byId("count").textContent;
   since = performance.now();
   mine.start(true).catch((error) => {

@@ -109,6 +109,12 @@ def gallery(folder: Path) -> dict[str, str]:
     return {}
 
 
+def pictures(folder: Path) -> dict[str, str]:
+    """The page of a study on a desktop and a phone."""
+    shutil.copytree(folder / "page", DOCS / "study", dirs_exist_ok=True)
+    return {}
+
+
 def heldout(folder: Path) -> dict[str, str]:
     """A table for each cell of the protocol, its figure, and its curves."""
     records = read_records(folder / CSV)
@@ -334,6 +340,15 @@ PARTS: dict[str, Part] = {
     "scale": measured("scale", "docs/speed.md", 5, "--plot {folder}/scale.png"),
     "train": measured("train", "docs/speed.md", 10),
     "main_job": measured("main_job", "docs/speed.md", 7),
+    "study": measured("study", "docs/study.md", 15),
+    "study_times": measured("study_times", "docs/study.md", 5),
+    "page": measured("page", "docs/study.md", 10),
+    "pictures": Part(
+        "docs/study.md",
+        ("python benchmarks/page.py --pictures {folder}/page -> page/error-phone.png",),
+        2,
+        pictures,
+    ),
     "dimension": measured("dimension", "docs/robustness.md", 30, "--features 8,16,32"),
 }
 """In the order in which they are made. The minutes of ``pretrained``, ``heldout`` and ``main_job``

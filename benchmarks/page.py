@@ -147,11 +147,9 @@ def compare(browser: Browser, typed: Namespace, scratch: Path) -> Iterator[Row]:
 def pictures(browser: Browser, scratch: Path, folder: Path) -> None:
     """The page as it looks on a desktop and on a phone."""
     folder.mkdir(parents=True, exist_ok=True)
-    text = scratch / "instructions.md"
-    text.write_text(INSTRUCTIONS)
-    study = scratch / "pictures"
+    text = ROOT / "examples" / "instructions.md"
     typed = "study.consent=true", f"study.instructions={text}", "study.title='How should it drive?'"
-    server = Server(f"hydra.run.dir={study}", "task=driver", *typed)
+    server = Server(f"hydra.run.dir={scratch}/study", "task=driver", *typed)
     for name, size in (("desktop", DESKTOP), ("phone", PHONE)):
         browser.size(size)
         browser.driver.get(server.link)
@@ -193,17 +191,6 @@ def save(browser: Browser, path: Path) -> None:
     browser.driver.save_screenshot(str(path))
     with Image.open(path) as image:
         image.convert("RGB").quantize(128, dither=Image.Dither.NONE).save(path, optimize=True)
-
-
-INSTRUCTIONS = """# How should a car drive near you?
-
-You see two ways in which the **orange** car may drive. The blue car changes its lane.
-
-- Watch both, as often as you like.
-- Choose the one that you would rather sit in.
-
-Your answers are kept under your code, without your name, and are used to learn what people want.
-"""
 
 
 def main() -> None:

@@ -15,16 +15,15 @@ from pathlib import Path
 ROOT = Path(__file__).parent.parent
 sys.path[0] = str(ROOT)  # and not this folder, whose select.py would hide Python's own
 
-import argparse
 import random
 import tempfile
 import threading
 from contextlib import suppress
 from typing import Any
 
-from tabulate import tabulate
 from tqdm import tqdm
 
+from benchmarks.common import Row, arguments, report, start
 from benchmarks.served import GONE, WATCHED, Server
 
 
@@ -127,8 +126,8 @@ class People:
             self.maybe_undone = None
 
 
-def kills(count: int, seed: int) -> bool:
-    """Kill the server so often; whether nothing was lost, doubled or moved."""
+def kills(count: int, seed: int) -> tuple[list[Row], list[str]]:
+    """Kill the server so often; the rows of the table, and what is wrong."""
     luck, people = random.Random(seed), People(seed)
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch) / "study"
@@ -146,11 +145,11 @@ def kills(count: int, seed: int) -> bool:
         for _ in range(5):
             people.step(server)
         server.close()
-        return report(folder, people, count)
+        return judge(folder, people, count)
 
 
-def report(folder: Path, people: People, count: int) -> bool:
-    """Hold the log against what people know; print what was found."""
+def judge(folder: Path, people: People, count: int) -> tuple[list[Row], list[str]]:
+    """Hold the log against what people know."""
     import ask
 
     study = ask.load_study(folder, ask.load_settings("resume", folder))
@@ -170,21 +169,22 @@ def report(folder: Path, people: People, count: int) -> bool:
         if study.people[code].session.weights.mean.tolist() != means:
             wrong.append(f"the log of {code} replays to another belief than the server showed")
     study.close()
-    rows = [["kill -9", count], *([name, number] for name, number in people.counts.items())]
-    rows += [["people", len(people.means)], ["in the log", len(answers)], ["wrong", len(wrong)]]
-    print(tabulate(rows, tablefmt="simple"))
-    for sentence in wrong[:10]:
-        print(sentence)
-    return not wrong
+    counts = {"kill -9": count, "people": len(people.means), **people.counts}
+    counts |= {"answers that stand in the log": len(answers), "anything wrong": len(wrong)}
+    return [{"what": name, "how often": number} for name, number in counts.items()], wrong
 
 
 def main() -> None:
     """Run what was typed."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser = arguments(__doc__)
     parser.add_argument("--kills", type=int, default=200, help="of the server (default 200)")
     parser.add_argument("--seed", type=int, default=0, help="of the moments and the people")
-    typed = parser.parse_args()
-    raise SystemExit(0 if kills(typed.kills, typed.seed) else 1)
+    typed = start(parser)
+    rows, wrong = kills(typed.kills, typed.seed)
+    report("A study under kills, double submits, reloads and two tabs", rows, typed.json)
+    for sentence in wrong[:10]:
+        print(sentence, file=sys.stderr)
+    raise SystemExit(bool(wrong))
 
 
 if __name__ == "__main__":

@@ -122,7 +122,7 @@ CHECKS = {
 }
 
 
-NO_SETTINGS = ("actor", "csv", "png", "py", "strategy")
+NO_SETTINGS = ("actor", "csv", "db", "md", "png", "pt", "py", "strategy")
 """``policy.actor`` is Python, and ``training.csv`` a file."""
 
 

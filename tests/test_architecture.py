@@ -34,6 +34,7 @@ ORDER = [
     "saved_session",
     "asking",
     "session",
+    "reward",
     "study",
     "sweeps",
 ]

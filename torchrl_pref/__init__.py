@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from torchrl_pref.questions.response_model import ResponseModel
     from torchrl_pref.questions.responses import Boltzmann, Optimal
     from torchrl_pref.questions.weak import Weak
+    from torchrl_pref.reward import Reward
     from torchrl_pref.session import Session
     from torchrl_pref.tasks.gridworld import gridworld_pool
 
@@ -33,6 +34,7 @@ __all__ = [
     "QueryEnv",
     "QueryPool",
     "ResponseModel",
+    "Reward",
     "Session",
     "SimulatedHuman",
     "Weak",
@@ -55,6 +57,7 @@ _MODULES = {
     "questions.response_model": ("ResponseModel",),
     "questions.responses": ("Boltzmann", "Optimal"),
     "questions.weak": ("Weak",),
+    "reward": ("Reward",),
     "session": ("Session",),
     "tasks.gridworld": ("gridworld_pool",),
 }

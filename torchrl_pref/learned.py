@@ -77,9 +77,8 @@ class Learned:
     @property
     def weights(self) -> Weights:
         """What is known of the weights: of their directions."""
-        samples = directions(self._states[-1]["samples"])
-        low, high = torch.quantile(samples, samples.new_tensor([0.05, 0.95]), dim=1)
-        mean, sd, low, high = map(self._plain, (samples.mean(1), samples.std(1), low, high))
+        parts = summary(directions(self._states[-1]["samples"]))
+        mean, sd, low, high = map(self._plain, parts)
         return Weights(mean, sd, low, high, self.pool.feature_names)
 
     @property
@@ -126,12 +125,24 @@ class Learned:
             raise InputError(
                 f"features of shape {tuple(features.shape)}: expected (n, {self.pool.n_features})"
             )
-        rewards = directions(self._states[-1]["samples"]) @ features.mT
-        return self._plain(rewards.mean(1)), self._plain(rewards.std(1))
+        mean, deviation = scores(directions(self._states[-1]["samples"]), features)
+        return self._plain(mean), self._plain(deviation)
 
     def _plain(self, tensor: Tensor) -> Tensor:
         """Without the leading B where there is one person."""
         return tensor[0] if self.people is None else tensor
+
+
+def summary(samples: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Mean, standard deviation, 5% and 95% quantile (B D) of directions (B M D)."""
+    low, high = torch.quantile(samples, samples.new_tensor([0.05, 0.95]), dim=1)
+    return samples.mean(1), samples.std(1), low, high
+
+
+def scores(samples: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation (… n) of the reward of features (n D) over directions (… M D)."""
+    rewards = samples @ features.mT
+    return rewards.mean(-2), rewards.std(-2)
 
 
 def expected_alignment(means: Sequence[Tensor]) -> Tensor:

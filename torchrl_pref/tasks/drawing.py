@@ -56,10 +56,15 @@ def save_picture(scenes: Scenes, path: str | Path) -> None:
             another ending or cannot be written.
     """
     path = checked(path, ".png", ".svg")
+    save_figure(picture_of(scenes), path)
+
+
+def picture_of(scenes: Scenes) -> Figure:
+    """A picture of whole trajectories, see :func:`save_picture`."""
     figure, panels = row_of(scenes)
     for axes, scene in panels:
         draw(axes, scene.frames[-1], scene)
-    save_figure(figure, path)
+    return figure
 
 
 def save_animation(scenes: Scenes, path: str | Path) -> None:
@@ -216,9 +221,8 @@ def _artist(axes: Axes, shape: Shape, scene: Scene) -> Artist:
         case Disc():
             return axes.add_patch(Circle(shape.centre, shape.radius, color=shape.colour, lw=0))
         case Label():
-            return axes.text(
-                *shape.at, shape.text, color=shape.colour, fontsize=8, ha="center", va="center"
-            )
+            plain = {"fontsize": 8, "ha": "center", "va": "center", "parse_math": False}
+            return axes.text(*shape.at, shape.text, color=shape.colour, **plain)
         case Picture():
             (left, low), (right, high) = scene.low, scene.high
             image = image_of(shape)

@@ -109,6 +109,12 @@ def gallery(folder: Path) -> dict[str, str]:
     return {}
 
 
+def drives(folder: Path) -> dict[str, str]:
+    """How a car drives before and after it learned what somebody wants."""
+    shutil.copy(folder / "drives.png", DOCS)
+    return {}
+
+
 def pictures(folder: Path) -> dict[str, str]:
     """The page of a study on a desktop and a phone."""
     shutil.copytree(folder / "page", DOCS / "study", dirs_exist_ok=True)
@@ -343,6 +349,12 @@ PARTS: dict[str, Part] = {
     "study": measured("study", "docs/study.md", 15),
     "study_times": measured("study_times", "docs/study.md", 5),
     "page": measured("page", "docs/study.md", 10),
+    "drives": Part(
+        "docs/reward.md",
+        ("python examples/drive_by_reward.py {folder} -> drives.png",),
+        0.2,
+        drives,
+    ),
     "pictures": Part(
         "docs/study.md",
         ("python benchmarks/page.py --pictures {folder}/page -> page/error-phone.png",),

@@ -221,8 +221,9 @@ def _artist(axes: Axes, shape: Shape, scene: Scene) -> Artist:
         case Disc():
             return axes.add_patch(Circle(shape.centre, shape.radius, color=shape.colour, lw=0))
         case Label():
-            plain = {"fontsize": 8, "ha": "center", "va": "center", "parse_math": False}
-            return axes.text(*shape.at, shape.text, color=shape.colour, **plain)
+            text = axes.text(*shape.at, shape.text, color=shape.colour, parse_math=False)
+            text.set(fontsize=8, ha="center", va="center")
+            return text
         case Picture():
             (left, low), (right, high) = scene.low, scene.high
             image = image_of(shape)

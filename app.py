@@ -154,7 +154,7 @@ def check_groups(settings: Plain) -> None:
         InputError: something cannot be made.
     """
     if open_groups(settings):
-        from torchrl_pref.build import check_groups
+        from torchrl_pref.trial import check_groups
 
         check_groups(cast(Settings, settings))
 

@@ -256,6 +256,7 @@ def evaluate_checkpoints(settings: Settings, paths: list[Path]) -> tuple[Records
     for its_settings, task, learned in groups:
         test = None
         if settings["pool"]["test"] is not None:
+            build.refuse_own_pools(its_settings, build.human_of(its_settings, task))
             test = QueryPool.load(settings["pool"]["test"]).map_features(task.normalizer)
         records.entries += comparison.evaluate_task(its_settings, task, learned, test, own).entries
         for key, checkpoint in learned.items():

@@ -112,7 +112,13 @@ def refusals() -> Iterator[None]:
 
 
 def _meant(text: str) -> str:
-    """The key that somebody may have meant, where Hydra says that there is no such."""
+    """What somebody may have meant, where Hydra says that there is no such key or choice."""
+    choice = re.search(
+        r"Could not find '(\w+)/([\w.]+)' Available options in '\w+': ([\w ]+)", text
+    )
+    if choice is not None:
+        close = difflib.get_close_matches(choice[2], choice[3].split(), 1)
+        return "".join(f"; did you mean {choice[1]}={name}?" for name in close)
     typed = re.search(r"Could not override '([\w.]+)'", text)
     if typed is None:
         return ""

@@ -27,6 +27,7 @@ ORDER = [
     "checkpoints",
     "problem",
     "build",
+    "trial",
     "evaluation",
     "training",
     "pretrained",

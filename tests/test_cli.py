@@ -264,6 +264,8 @@ PRETRAINED = ROOT / "torchrl_pref" / "policies" / "weights" / "query-noisy-0.pt"
 BAD_INPUT = [
     ("train", "setup=nonsense", "Could not find 'setup/nonsense'"),
     ("train", "policy=nonsense", "Could not find 'policy/nonsense'"),
+    ("train", "policy=pretraind", "did you mean policy=pretrained?"),
+    ("train", "human=myopic pool.train={tmp}/plain.pt pool.test={tmp}/plain.pt", "not a pool of"),
     ("train", "nonsense=1", "Could not override 'nonsense'"),
     ("train", "pool.sise=3", "did you mean pool.size?"),
     ("train", "columns=[a]", "did you mean task.columns?"),

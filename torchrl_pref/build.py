@@ -21,64 +21,16 @@ from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.envs.session import is_feed
 from torchrl_pref.errors import InputError, check_seed
-from torchrl_pref.groups import find, make, where
+from torchrl_pref.groups import make
 from torchrl_pref.humans.base import HumanBase
 from torchrl_pref.humans.demonstrations import Demonstrations
 from torchrl_pref.policies.base import Policy
 from torchrl_pref.pool import Normalizer, QueryPool
 from torchrl_pref.problem import Human, Problem, solve_tau
-from torchrl_pref.questions.responses import model_of
 from torchrl_pref.tasks.base import make_pool
 
 ANSWERING = ("tau", "lapse")
 """Settings of a human, or of a belief, that are of the response model, and not of their kind."""
-
-
-def check_groups(settings: Settings) -> None:
-    """Refuse groups that cannot be made, before anything else is.
-
-    Raises:
-        InputError: one cannot.
-    """
-    own_pools = settings["pool"]["train"] is not None
-    n_options = None if own_pools else settings["pool"]["options"]
-    question, tried = make("question", settings["question"]), None
-    if n_options is not None:
-        question.answers(n_options)
-        tried = _try_task(settings)
-    taus = settings["tau"] if isinstance(settings["tau"], list) else [settings["tau"]]
-    for tau in taus:
-        human, belief = settings["human"], settings["belief"]
-        own = tau if human["tau"] is None else human["tau"]
-        for group, section, known in (("human", human, own), ("belief", belief, tau)):
-            number = None if known == "optimal" else 1.0 if known == "noisy" else float(known)
-            model = model_of(number, question, section["lapse"])
-            if n_options is not None:
-                model.n_answers(n_options)  # or it is refused here
-            made = make(group, section, model, without=ANSWERING)
-            weighs = group == "human" and made.step_weights(1) is not None
-            if weighs and tried is not None:
-                weigh_steps(settings, made, tried)
-    if settings.get("policy", {}).get("name", "pretrained") != "pretrained":
-        find("policy", settings["policy"])
-
-
-def _try_task(settings: Settings) -> QueryPool:
-    """Make the task, and a query about it.
-
-    Raises:
-        InputError: it cannot be made, or fails.
-    """
-    task = make("task", settings["task"])
-    try:
-        return make_pool(task, 1, settings["pool"]["options"], seed=0)
-    except InputError:
-        raise
-    except Exception as error:
-        named = settings["task"].get("make", settings["task"]["name"])
-        raise InputError(
-            f"task={named}: its first trajectories fail ({where(error)}); mend it, or its settings"
-        ) from error
 
 
 def make_pools(settings: Settings, test_seed: int | None = None) -> tuple[QueryPool, QueryPool]:
@@ -129,13 +81,29 @@ def weigh_steps(settings: Settings, human: HumanBase, pool: QueryPool) -> Tensor
     if weights is None:
         return None
     if shown is None or settings["pool"]["train"] is not None:
+        refuse_own_pools(settings, human)
+    steps = make("task", settings["task"]).step_features(shown)
+    return torch.einsum("t,nktd->nkd", weights.to(steps), steps)
+
+
+def human_of(settings: Settings, task: Problem) -> HumanBase:
+    """Who answers, by the section ``human``."""
+    made: HumanBase = make("human", settings["human"], task.human_model, without=ANSWERING)
+    return made
+
+
+def refuse_own_pools(settings: Settings, human: HumanBase) -> None:
+    """Refuse to ask a human who weighs steps about queries of the user's own.
+
+    Raises:
+        InputError: they weigh steps.
+    """
+    if human.step_weights(1) is not None:
         raise InputError(
             f"human={settings['human']['name']} weighs the steps of trajectories, which only a "
             "task tells and not a pool of your own; leave pool.train and pool.test out, or choose "
             "another human"
         )
-    steps = make("task", settings["task"]).step_features(shown)
-    return torch.einsum("t,nktd->nkd", weights.to(steps), steps)
 
 
 def make_task(
@@ -257,7 +225,7 @@ def _session_arguments(
     settings: Settings, task: Problem, pool: QueryPool, sessions: int, seed: int
 ) -> dict[str, Any]:
     """What both environments are made with."""
-    human = make("human", settings["human"], task.human_model, without=ANSWERING)
+    human = human_of(settings, task)
     seen = weigh_steps(settings, human, pool)
     return {
         "human": human,

@@ -35,7 +35,7 @@ from torchrl_pref.humans.base import REFUSED
 from torchrl_pref.learned import Learned, Turn, expected_gain
 from torchrl_pref.pool import Normalizer, QueryPool
 from torchrl_pref.questions.base import answers_on
-from torchrl_pref.questions.prior_evidence import Shown, given_digest, rows_of_shown
+from torchrl_pref.questions.prior_evidence import Shown, check_given, given_digest, rows_of_shown
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.saved_session import EARLIER, FORMAT, check_content
 from torchrl_pref.strategies import MakeStrategy
@@ -116,6 +116,7 @@ class Session(Learned):
         self._hidden = self._env.draw_questions(size)
         luck, n_features = Generator().manual_seed(self.seed), self.pool.n_features
         state = begin(belief.prior(size, n_features, luck), budget, self.pool.n_options)
+        given = check_given(given)
         if given:
             shown = rows_of_shown(given, size, n_features, response_model)
             state = hear(belief, state, shown, luck)
@@ -177,7 +178,7 @@ class Session(Learned):
             raise InputError("an answer to no question: expected ask() before tell()")
         given = [answer] if self.people is None else answer
         if not isinstance(given, Sequence):
-            raise InputError(f"answer={answer!r}: expected a list, one for each person")
+            raise InputError(f"answer={answer!s:.60}: expected a list, one for each person")
         self._let_in(Turn(self._asked, self._said(given)))
 
     def put(self, query: int | Sequence[int], n_offered: int | None = None) -> None:

@@ -62,7 +62,7 @@ def check_finite(name: str, *tensors: Tensor) -> None:
         InputError: there is one.
     """
     # One entry that is not finite makes the sum so: a single number to look at for each tensor.
-    if not math.isfinite(sum(float(tensor.sum()) for tensor in tensors)):
+    if not math.isfinite(sum(float(tensor.detach().sum()) for tensor in tensors)):
         raise InputError(
             f"{name}: NaN, infinity or a number too large for float32; expected finite numbers; "
             "look where they were made"

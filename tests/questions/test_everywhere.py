@@ -14,7 +14,7 @@ from torch import Generator, Tensor
 
 from torchrl_pref import Session
 from torchrl_pref.beliefs.sampled import Belief
-from torchrl_pref.build import check_groups, make_pools, make_task
+from torchrl_pref.build import make_pools, make_task
 from torchrl_pref.config.settings import check_train_settings
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.objectives import OBJECTIVES, alignment
@@ -32,6 +32,7 @@ from torchrl_pref.questions.calibrate import calibrate_tau
 from torchrl_pref.questions.responses import Boltzmann
 from torchrl_pref.strategies import STRATEGIES
 from torchrl_pref.training.start import make_checkpoint
+from torchrl_pref.trial import check_groups
 
 OPTIONS = {"choice": 2, "weak": 2, "ranking": 3, "best_worst": 4, "approve": 1}
 KINDS = pytest.mark.parametrize("name", QUESTIONS)

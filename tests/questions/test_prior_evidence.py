@@ -19,6 +19,7 @@ from torchrl_pref.humans.simulated import SimulatedHuman
 from torchrl_pref.pool import QueryPool
 from torchrl_pref.questions.prior_evidence import (
     Shown,
+    check_given,
     correction,
     demonstration,
     given_digest,
@@ -209,13 +210,32 @@ def test_what_cannot_be_shown_is_refused() -> None:
         (lambda: rows_of_shown([correction(one, one)], 1, 4, model), "with D=4"),
         (lambda: rows_of_shown([correction(many, many)], 2, 3, model), "of each of 2"),
         (lambda: rows_of_shown([correction(one, one, 2.0)], 1, 3, Optimal()), "never errs"),
-        (lambda: rows_of_shown(demonstration(one, many), 1, 3, model), "expected a list"),
+        (lambda: check_given(demonstration(one, many)), "given of type Shown: expected a list"),
+        (lambda: check_given(None), "given of type NoneType: expected a list"),
+        (lambda: check_given({}), "given of type dict: expected a list"),
+        (lambda: check_given([3]), "given of type list: expected a list of what"),
+        (lambda: Session(torch.rand(30, 2, 3), model, given=0), "given of type int"),
+        (lambda: correction(one, [1.0]), "before of type list"),  # type: ignore[arg-type]
+        (lambda: correction(one, torch.tensor(1.0)), r"before of shape \(\)"),
+        (lambda: correction(one.double() * 1e300, one), "too large for float32"),
+        (lambda: Shown([1.0]), "rows of type list"),  # type: ignore[arg-type]
+        (lambda: Shown(torch.ones(3)), r"rows of shape \(3,\): expected \(… J D\)"),
+        (lambda: Shown(torch.ones(1, 3), "x"), "tau='x': expected a finite number"),
         (lambda: Demonstrations(-1), "demonstrations.count=-1"),
         (lambda: Demonstrations(1, 0), "demonstrations.alternatives=0"),
         (lambda: Demonstrations(1, tau=-1.0), "tau=-1"),
     ):
         with pytest.raises(InputError, match=words):
             make()  # type: ignore[no-untyped-call]
+
+
+def test_gradients_and_doubles_make_no_difference() -> None:
+    rows = torch.tensor([[1.0, 2.0, 3.0]])
+    plain = Session(torch.rand(30, 2, 3), Boltzmann(2.0), given=[Shown(rows)])
+    for other in (rows.double(), rows.clone().requires_grad_()):
+        same = Session(plain.pool, Boltzmann(2.0), given=[Shown(other)])
+        assert same.to_dict() == plain.to_dict()
+        assert torch.equal(same.samples, plain.samples)
 
 
 def test_digests_tell_what_was_given(generator: Generator) -> None:

@@ -143,6 +143,26 @@ def parquet_bytes(made: pa.Table, **options: object) -> bytes:
     return file.getvalue()
 
 
+def varint(number: int) -> bytes:
+    """A whole number of 0 or more, as Thrift's compact protocol writes it."""
+    doubled, found = 2 * number, []
+    while doubled > 0x7F:
+        found.append(doubled & 0x7F | 0x80)
+        doubled >>= 7
+    return bytes([*found, doubled])
+
+
+def lying_parquet(claimed: int) -> bytes:
+    """A small file whose footer claims more rows."""
+    rows = 12345  # whose bytes stand for nothing else in the footer
+    data = parquet_bytes(pa.table(dict.fromkeys("ab", np.arange(float(rows)))))
+    (length,) = struct.unpack("<I", data[-8:-4])
+    body, footer = data[: -8 - length], data[-8 - length : -8]
+    assert varint(rows) in footer
+    lying = footer.replace(varint(rows), varint(claimed))
+    return body + lying + struct.pack("<I", len(lying)) + b"PAR1"
+
+
 def with_nan() -> np.ndarray:
     spoiled = X.copy()
     spoiled[6, 1] = np.nan
@@ -168,6 +188,18 @@ BAD: dict[str, tuple[str, Callable[[], bytes | str], str]] = {
         lambda: npz(features=X, feature_names=np.empty(10**7, "<U0")),
         "expected numbers",
     ),
+    "npz: many names of no length": (
+        ".npz",
+        lambda: zipped({"feature_names.npy": npy((10**4, 0), dtype="<U9"), "a.npy": npy((2,))}),
+        "a row of at most",
+    ),
+    "npz: columns that grow together": (
+        ".npz",
+        lambda: zipped(
+            {f"{name}.npy": npy((10**6,), bytes(10**6), "<u1") for name in "abcdefghi"}, True
+        ),
+        "it would take 72 MB; expected at most",
+    ),
     "npz: small numbers that grow": (
         ".npz",
         lambda: zipped({"features.npy": npy((2**23 + 1, 1), bytes(2**23 + 1), "|u1")}, packed=True),
@@ -184,7 +216,8 @@ BAD: dict[str, tuple[str, Callable[[], bytes | str], str]] = {
     "csv: ragged": (".csv", lambda: "a,b\n1,2\n3\n", "line 3 has 1 cells"),
     "csv: cut off": (".csv", lambda: csv_text()[: -len("0.123,") * 8], "cells|shape"),
     "csv: two of one name": (".csv", lambda: "a,b, a\n1,2,3\n", "'a' twice"),
-    "csv: no comma": (".csv", lambda: "a;b\n1;2\n", "'1;2' in column"),
+    "csv: no comma": (".csv", lambda: "a;b\n1;2\n", "has semicolons between"),
+    "csv: tabs": (".csv", lambda: "a\tb\n1\t2\n", "has tabs between its columns; expected commas"),
     "csv: a zip": (".csv", lambda: npz(**BY_NAME), "cannot be read|letters|column|cells|UTF-8"),
     "csv: zeros": (".csv", lambda: bytes(2**22), "cannot be read|letters"),
     "csv: one line": (".csv", lambda: "1," * 2**21, "a line of more than"),
@@ -287,6 +320,16 @@ BAD: dict[str, tuple[str, Callable[[], bytes | str], str]] = {
         "other length",
     ),
     "parquet: cut off": (".parquet", lambda: parquet_bytes(table())[:-30], "cannot be read"),
+    "parquet: 3 billion rows claimed": (
+        ".parquet",
+        lambda: lying_parquet(3 * 10**9),
+        "says that it unpacks to 48000 MB",
+    ),
+    "parquet: a million rows claimed": (
+        ".parquet",
+        lambda: lying_parquet(10**6),
+        "says that it has 1,000,000 rows, and 12,345 are there",
+    ),
     "parquet: text": (".parquet", lambda: csv_text(), "cannot be read"),
     "parquet: NaN": (".parquet", lambda: parquet_bytes(table(more=with_nan()[:, 1])), "holds NaN"),
     "parquet: missing": (

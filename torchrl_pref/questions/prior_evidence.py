@@ -16,7 +16,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypedDict
+from typing import Any, TypedDict
 
 import torch
 from torch import Tensor
@@ -34,12 +34,23 @@ class Shown:
     """What was preferred to J others, of one person or of several.
 
     Attributes:
-        rows: (… J D), features of what was preferred less those of each of the others.
+        rows: (… J D) float32, features of what was preferred less those of each of the others;
+            without the gradients of what was given.
         tau: what their returns are multiplied by; None: as much as those of the answers.
+
+    Raises:
+        InputError: the rows are not (… J ≥ 1, D) finite numbers, or tau is not above 0.
     """
 
     rows: Tensor
     tau: float | None = None
+
+    def __post_init__(self) -> None:
+        check_tau(self.tau)
+        if check_plain("rows", self.rows).ndim < 2 or 0 in self.rows.shape:
+            raise InputError(f"rows of shape {tuple(self.rows.shape)}: expected (… J D)")
+        object.__setattr__(self, "rows", self.rows.detach().float())
+        check_finite("features of a demonstration or correction", self.rows)
 
 
 class Given(TypedDict):
@@ -72,7 +83,7 @@ def demonstration(shown: Tensor, alternatives: Tensor, tau: float | None = None)
         )
     if alternatives.shape[-2] == 0:
         raise InputError("alternatives of shape (… 0 D): expected at least one to be preferred to")
-    return Shown(shown.float().unsqueeze(-2) - alternatives.float(), check_tau(tau))
+    return Shown(shown.float().unsqueeze(-2) - alternatives.float(), tau)
 
 
 def correction(after: Tensor, before: Tensor, tau: float | None = None) -> Shown:
@@ -86,6 +97,8 @@ def correction(after: Tensor, before: Tensor, tau: float | None = None) -> Shown
     Raises:
         InputError: the features do not belong together or are not finite, or tau is not above 0.
     """
+    if check_plain("before", before).ndim < 1:
+        raise InputError("before of shape (): expected features (… D), as in the pool")
     return demonstration(after, before.unsqueeze(-2), tau)
 
 
@@ -96,6 +109,20 @@ def check_tau(tau: float | None) -> float | None:
         InputError: it is not.
     """
     return None if tau is None else check_positive("tau", tau)
+
+
+def check_given(given: Any) -> tuple[Shown, ...]:
+    """Return demonstrations and corrections of people.
+
+    Raises:
+        InputError: it is no list of them.
+    """
+    if not isinstance(given, list | tuple) or not all(isinstance(one, Shown) for one in given):
+        raise InputError(
+            f"given of type {type(given).__name__}: expected a list of what demonstration(…) and "
+            "correction(…) make, as in given=[demonstration(…)]"
+        )
+    return tuple(given)
 
 
 def rows_of_shown(
@@ -112,11 +139,6 @@ def rows_of_shown(
     Raises:
         InputError: features are not those of B people, or the model has no tau to compare with.
     """
-    if not isinstance(shown, Sequence) or not all(isinstance(one, Shown) for one in shown):
-        raise InputError(
-            f"given of type {type(shown).__name__}: expected a list of what demonstration(…) and "
-            "correction(…) make, as in given=[demonstration(…)]"
-        )
     most = max(one.rows.shape[-2] for one in shown)
     rows, offsets = [], []
     for one in shown:

@@ -29,6 +29,31 @@ class Refused(Exception):
     """Why a file is refused, without its path."""
 
 
+class Room:
+    """How many bytes the columns of a file may still take, all together, as float64.
+
+    Args:
+        limit: of all.
+    """
+
+    def __init__(self, limit: int) -> None:
+        self.limit, self._taken = limit, 0
+
+    def take(self, name: str, count: int) -> None:
+        """Make room for so many numbers.
+
+        Raises:
+            Refused: there is none.
+        """
+        self._taken += 8 * count
+        if self._taken > self.limit:
+            raise Refused(
+                f"with array {name!r:.80} of {count:,} numbers it would take "
+                f"{self._taken / 1e6:.0f} MB; expected at most {self.limit / 1e6:.0f} MB from a "
+                "file of its size; leave some out"
+            )
+
+
 class Choice(NamedTuple):
     """Which columns are read."""
 

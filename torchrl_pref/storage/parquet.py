@@ -36,6 +36,11 @@ def read_parquet(path: str, limit: int, choice: Choice) -> Columns:
                 f"{limit / 1e6:.0f} MB from a file of its size"
             )
         table = file.read(columns=chosen, use_threads=False)
+    if table.num_rows != metadata.num_rows:
+        raise Refused(
+            f"says that it has {metadata.num_rows:,} rows, and {table.num_rows:,} are there; save "
+            "it again"
+        )
     missing = [name for name in chosen if table.column(name).null_count]
     if missing:
         raise Refused(f"column {missing[0]!r} lacks values; expected a number in each row")

@@ -35,6 +35,7 @@ from torchrl_pref.storage.columns import (
     Choice,
     Columns,
     Refused,
+    Room,
     of_arrays,
 )
 from torchrl_pref.storage.files import MAX_FILE, PIECE, Piecewise, size_of
@@ -126,6 +127,11 @@ def _csv(path: str, limit: int, choice: Choice) -> Columns:
     with open(path, encoding="utf-8-sig", newline="") as file:
         lines = csv.reader(_lines(file), strict=True)
         header = [name.strip() for name in next(lines, [])]
+        other = [
+            name for mark, name in SEPARATORS.items() if len(header) == 1 and mark in header[0]
+        ]
+        if other:
+            raise Refused(f"has {other[0]} between its columns; expected commas; save it so")
         if header and all(is_number(name) for name in header):
             raise Refused(
                 f"has no names in its first line ({', '.join(header)!s:.80}); expected a header of "
@@ -159,6 +165,9 @@ def _csv(path: str, limit: int, choice: Choice) -> Columns:
     return columns
 
 
+SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars"}
+
+
 def is_number(text: str) -> bool:
     """Whether it is a number and no name."""
     try:
@@ -189,15 +198,17 @@ def _npz(path: str, limit: int, choice: Choice) -> Columns:
                 "from a file of its size; save it by numpy.savez, which does not pack"
             )
 
+        room = Room(limit)
+
         def load(name: str) -> np.ndarray[Any, Any]:
-            return _array(archive, members[name], name, limit)
+            return _array(archive, members[name], name, room)
 
         labels = load(NAMES).tolist() if NAMES in members else None
         return of_arrays([name for name in members if name != NAMES], load, labels, choice)
 
 
 def _array(
-    archive: zipfile.ZipFile, member: zipfile.ZipInfo, name: str, limit: int
+    archive: zipfile.ZipFile, member: zipfile.ZipInfo, name: str, room: Room
 ) -> np.ndarray[Any, Any]:
     """One array of an NPZ, once its header fits the bytes that are there and the limit.
 
@@ -215,44 +226,34 @@ def _array(
                 f"array {name!r:.80} holds {dtype}; expected numbers, or texts as names; Python "
                 "objects are pickles, which are never read"
             )
-        if not dtype.itemsize or (name == NAMES and math.prod(shape) > MAX_COLUMNS):
+        # Of texts in several dimensions a list would be made of lists, which take more.
+        too_many = name == NAMES and (len(shape) != 1 or shape[0] > MAX_COLUMNS)
+        if not dtype.itemsize or too_many:
             raise Refused(
-                f"array {name!r:.80} of shape {shape} holds {dtype}; expected numbers, or at most "
-                f"{MAX_COLUMNS} names"
+                f"array {name!r:.80} of shape {shape} holds {dtype}; expected numbers, or a row "
+                f"of at most {MAX_COLUMNS} names"
             )
         if math.prod(shape) * dtype.itemsize + file.tell() != member.file_size:
             raise Refused(
                 f"array {name!r:.80} says that it is {shape} of {dtype}, and {member.file_size} "
                 "bytes are there; save it again"
             )
-    check_room(name, math.prod(shape), limit)
+    room.take(name, math.prod(shape))
     with archive.open(member) as file:
         values: np.ndarray[Any, Any] = np.lib.format.read_array(file, allow_pickle=False)
         file.read(1)  # the end, where the checksum is compared
     return values
 
 
-def check_room(name: str, count: int, limit: int) -> None:
-    """Refuse numbers that would take more bytes than the limit, as float64.
-
-    Raises:
-        Refused: they would.
-    """
-    if 8 * count > limit:
-        raise Refused(
-            f"array {name!r:.80} of {count:,} numbers would take {8 * count / 1e6:.0f} MB; "
-            f"expected at most {limit / 1e6:.0f} MB from a file of its size; leave some out"
-        )
-
-
 def _safetensors(path: str, limit: int, choice: Choice) -> Columns:
     """Columns of a Safetensors file; the library holds its header against its bytes."""
     from safetensors import safe_open
 
+    room = Room(limit)
     with safe_open(path, framework="pt") as file:
 
         def load(name: str) -> np.ndarray[Any, Any]:
-            check_room(name, math.prod(file.get_slice(name).get_shape()), limit)
+            room.take(name, math.prod(file.get_slice(name).get_shape()))
             tensor = file.get_tensor(name)
             values: np.ndarray[Any, Any] = tensor.to(torch.float64, copy=True).numpy()
             return values

@@ -81,8 +81,9 @@ class RecordedTask(Task):
             )
         else:
             raise InputError(
-                f"{self._source}: too few for a pool, with {n_rows} for it; expected at least "
-                f"{n_options} trajectories, or one query, for each of the two pools; add some"
+                f"{self._source}: {n_rows} trajectories or queries are left for one of the two "
+                f"pools; expected at least {n_options} trajectories, or one query, for each; add "
+                "some"
             )
         order = torch.randperm(len(queries), generator=Generator().manual_seed(seed))
         return queries[order[:n_queries]].unsqueeze(-1)

@@ -8,7 +8,10 @@ Shapes: T frames.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
+from functools import lru_cache
+from itertools import product
+from statistics import fmean
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -24,13 +27,13 @@ ACROSS, UP = 2, 4
 PATTERN = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]])
 """What the dots of a cell add to the number of a Braille pattern."""
 
-MARKS = ("○●", "□■", "△▲", "◇◆")
+MARKS = (("○", "●"), ("□", "■"), ("△", "▲"), ("◇", "◆"))
 """Where each of the things that move starts, and where it is."""
 
 SHADES = ((0.17, " "), (0.22, "░"), (0.27, "▒"), (1.0, "▓"))
 """Of a fill without colour, by how dark it is at most."""
 
-PAPER = (255, 255, 255)
+PAPER, GREY = (255, 255, 255), (85, 85, 85)
 
 FARTHEST = 1e4
 """Dots from the corner that anything is drawn to."""
@@ -54,17 +57,16 @@ class Cell(NamedTuple):
     ground: Colour
 
 
-def draw(scene: Scene, size: Size, step: int | None, coloured: bool) -> list[str]:
-    """A trajectory in rows of letters.
+def draw(scene: Scene, size: Size, step: int | None = None) -> list[list[Cell]]:
+    """Draw a trajectory.
 
     Args:
         scene: of the trajectory; pictures in it are left out.
         size: of the drawing.
         step: the frame that is shown, 0 to T-1; None: the last, and where everything started.
-        coloured: by escape sequences for 256 colours, on a white ground.
 
     Returns:
-        The rows, as wide as the size says.
+        Cells by row and column.
     """
     drawing = Drawing(size, scene.low, scene.high)
     for shape in scene.still:
@@ -82,8 +84,7 @@ def draw(scene: Scene, size: Size, step: int | None, coloured: bool) -> list[str
         if step is None:
             drawing.write(way[0], start, colour)
         drawing.write(way[now], here, colour)
-    rows = drawing.cells()
-    return [_with_colours(row) if coloured else _without_colours(row) for row in rows]
+    return drawing.cells()
 
 
 def ways_of(scene: Scene) -> list[tuple[tuple[Point, ...], str]]:
@@ -91,8 +92,9 @@ def ways_of(scene: Scene) -> list[tuple[tuple[Point, ...], str]]:
     found = []
     for shapes in zip(*scene.frames, strict=False):
         way = tuple(middle for shape in shapes if (middle := _middle(shape)) is not None)
-        if len(way) == len(scene.frames) and len(set(way)) > 1:
-            found.append((way, shapes[-1].colour))
+        last = shapes[-1]
+        if len(way) == len(shapes) and len(set(way)) > 1 and not isinstance(last, Picture):
+            found.append((way, last.colour))
     return found
 
 
@@ -101,8 +103,8 @@ def _middle(shape: Shape) -> Point | None:
         case Disc():
             return shape.centre
         case Line() | Patch():
-            x, y = np.mean(shape.points, 0).tolist()
-            return x, y
+            xs, ys = zip(*shape.points, strict=True)
+            return fmean(xs), fmean(ys)
         case _:
             return None
 
@@ -122,16 +124,16 @@ class Drawing:
         self._inked = Image.new("L", dots)
         self._letters: dict[tuple[int, int], tuple[str, Colour]] = {}
 
-    def fill(self, shape: Shape) -> None:
+    def fill(self, shape: Patch | Disc) -> None:
         """Colour the ground."""
-        self._shape(self._ground, shape, shape.colour)
+        self._shape(self._ground, shape, _rgb(shape.colour))
 
     def ink(self, shape: Shape) -> None:
         """Draw in dots."""
         if isinstance(shape, Label):
             self.write(shape.at, shape.text, shape.colour)
         elif not isinstance(shape, Picture):
-            self._shape(self._ink, shape, shape.colour)
+            self._shape(self._ink, shape, _rgb(shape.colour))
             self._shape(self._inked, shape, 255)
 
     def write(self, at: Point, text: str, colour: str) -> None:
@@ -172,7 +174,7 @@ class Drawing:
         dots = np.asarray(image).reshape(rows, UP, columns, ACROSS, -1)
         return dots.transpose(0, 2, 1, 3, 4).reshape(rows, columns, ACROSS * UP, -1)
 
-    def _shape(self, image: Image.Image, shape: Shape, colour: str | int) -> None:
+    def _shape(self, image: Image.Image, shape: Shape, colour: Colour | int) -> None:
         pen = ImageDraw.Draw(image)
         match shape:
             case Patch():
@@ -182,7 +184,7 @@ class Drawing:
                 for part in _dashes(dots) if shape.dashed else [dots]:
                     pen.line(part, fill=colour)
             case Disc():
-                (x, y), far = shape.centre, shape.radius
+                (x, y), far = shape.centre, abs(shape.radius)
                 pen.ellipse(self._dots([(x - far, y + far), (x + far, y - far)]), fill=colour)
 
     def _dots(self, points: Iterable[Point]) -> list[tuple[float, float]]:
@@ -190,29 +192,32 @@ class Drawing:
         (left, low), (right, high) = self._low, self._high
         columns, rows = self._size
         given = np.array(list(points), dtype=float)
-        shares = np.stack(
-            [(given[:, 0] - left) / (right - left), (high - given[:, 1]) / (high - low)]
-        )
-        dots = shares.T * (columns * ACROSS, rows * UP) - 0.5
+        wide, tall = max(right - left, 1e-9), max(high - low, 1e-9)
+        shares = (given - (left, high)) / (wide, -tall)
+        dots = shares * (columns * ACROSS, rows * UP) - 0.5
         near = np.clip(np.nan_to_num(dots), -FARTHEST, FARTHEST)
         return [(x, y) for x, y in near.round().tolist()]
 
 
-def _dashes(dots: Sequence[tuple[float, float]]) -> list[list[tuple[float, float]]]:
+def _dashes(dots: list[tuple[float, float]]) -> list[list[tuple[float, float]]]:
     """A line in pieces."""
-    given = np.array(dots)
-    along = np.concatenate([[0.0], np.hypot(*np.diff(given, axis=0).T).cumsum()])
+    across, down = np.array(dots).T
+    along = np.concatenate([[0.0], np.hypot(np.diff(across), np.diff(down)).cumsum()])
     starts = np.arange(0, along[-1], 2 * DASH)
     ends = np.minimum(starts + DASH - 1, along[-1])
-    pieces = []
-    for start, end in zip(starts, ends, strict=True):
-        piece = [[np.interp(at, along, given[:, axis]) for axis in (0, 1)] for at in (start, end)]
-        pieces.append([(float(x), float(y)) for x, y in piece])
-    return pieces
+    begin, end = (
+        zip(np.interp(at, along, across).tolist(), np.interp(at, along, down).tolist(), strict=True)
+        for at in (starts, ends)
+    )
+    return [list(piece) for piece in zip(begin, end, strict=True)]
 
 
 def _rgb(colour: str) -> Colour:
-    red, green, blue = ImageColor.getrgb(colour)[:3]
+    """A colour by its code or its name; grey where it has another name."""
+    try:
+        red, green, blue = ImageColor.getrgb(colour)[:3]
+    except ValueError:
+        return GREY
     return red, green, blue
 
 
@@ -221,29 +226,46 @@ def _tuple(colour: np.ndarray) -> Colour:
     return red, green, blue
 
 
-def _without_colours(row: list[Cell]) -> str:
-    return "".join(one.letter if one.letter != " " else _shade(one.ground) for one in row)
+def as_text(cells: list[list[Cell]], colours: int) -> list[str]:
+    """A drawing as rows of letters.
+
+    Args:
+        cells: by row and column.
+        colours: that the terminal has: 2²⁴, 256, or 0 for none; by escape sequences.
+    """
+    if not colours:
+        return ["".join(_plain(cell) for cell in row) for row in cells]
+    code = _code_of_24_bit if colours > 256 else _code_of_256
+    rows = []
+    for row in cells:
+        text, last = "", ""
+        for cell in row:
+            wanted = f"\x1b[38;{code(cell.colour)};48;{code(cell.ground)}m"
+            text += (wanted if wanted != last else "") + cell.letter
+            last = wanted
+        rows.append(f"{text}\x1b[0m")
+    return rows
 
 
-def _shade(ground: Colour) -> str:
-    dark = 1 - (0.299 * ground[0] + 0.587 * ground[1] + 0.114 * ground[2]) / 255
-    return next(letter for most, letter in SHADES if dark <= most)
+def _plain(cell: Cell) -> str:
+    """A letter for a cell without its colours."""
+    red, green, blue = cell.ground
+    dark = 1 - (0.299 * red + 0.587 * green + 0.114 * blue) / 255
+    shade = next(letter for most, letter in SHADES if dark <= most)
+    return shade if cell.letter == " " else cell.letter
 
 
-def _with_colours(row: list[Cell]) -> str:
-    text, last = "", ""
-    for one in row:
-        wanted = f"\x1b[38;5;{_of_256(one.colour)};48;5;{_of_256(one.ground)}m"
-        text += (wanted if wanted != last else "") + one.letter
-        last = wanted
-    return text + "\x1b[0m"
+def _code_of_24_bit(colour: Colour) -> str:
+    return "2;{};{};{}".format(*colour)
 
 
-def _of_256(colour: Colour) -> int:
-    """The number of the nearest of the colours that all terminals have."""
-    if max(colour) - min(colour) < 8:
-        grey = round((sum(colour) / 3 - 8) / 10)
-        return 231 if grey > 23 else 232 + max(0, grey)
-    steps = (0, 95, 135, 175, 215, 255)
-    red, green, blue = (min(range(6), key=lambda n: abs(steps[n] - one)) for one in colour)
-    return 16 + 36 * red + 6 * green + blue
+@lru_cache(maxsize=4096)
+def _code_of_256(colour: Colour) -> str:
+    """Of the nearest: the first 16 are as the person set them, and are not used."""
+    return f"5;{16 + int(((COLOURS - colour) ** 2).sum(1).argmin())}"
+
+
+STEPS = (0, 95, 135, 175, 215, 255)
+
+COLOURS = np.array([*product(STEPS, repeat=3), *((8 + 10 * n,) * 3 for n in range(24))])
+"""Colours 16 to 255 of a terminal that has 256: red, green and blue."""

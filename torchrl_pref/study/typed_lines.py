@@ -1,0 +1,92 @@
+"""What a person types in the terminal, and what it means.
+
+Letters: R possible answers.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Mapping
+from string import ascii_lowercase
+from typing import Any, NamedTuple
+
+
+class Command(NamedTuple):
+    """What can be typed beside answers."""
+
+    key: str
+    """Short; it is none where an answer has the same."""
+    word: str
+    short: str
+    """What it does, in the line below a question."""
+    help: str
+
+
+COMMANDS = (
+    Command("r", "replay", "replay", "watch the options again"),
+    Command("?", "s", "cannot say", "you cannot say; s is the same"),
+    Command("u", "undo", "undo", "take an answer back; u 3 takes back the third"),
+    Command("w", "what", "what has been learned", "what has been learned so far"),
+    Command("h", "help", "help", "this list, and what you read before the first question"),
+    Command("q", "quit", "stop", "stop here; you can go on later"),
+)
+
+BESIDE = ("u", "w", "h", "q")
+"""Keys of what can be done where no question is open."""
+
+
+class Typed(NamedTuple):
+    """What a line means."""
+
+    command: str
+    """The key of a command, or ``answer``."""
+    number: int | None = None
+    """Of an answer, or what was typed behind the command."""
+
+
+def keys_of(answers: list[dict[str, Any]]) -> dict[str, int]:
+    """R answers (:func:`state.possible_answers`) by what is typed for each: its key, or the letters
+    of the places that a person points at, or its number."""
+    found = {}
+    for one in answers:
+        letters = "".join(ascii_lowercase[place] for place in one["places"] or ())
+        found[one["key"] or letters or str(one["answer"] + 1)] = one["answer"]
+    return found
+
+
+def understood(line: str, answers: Mapping[str, int], commands: Collection[str]) -> Typed | None:
+    """What a line means; None where it means nothing.
+
+    Args:
+        line: as typed.
+        answers: numbers of answers, by what is typed for them.
+        commands: keys of the commands that there are.
+    """
+    line = line.strip().lower()
+    together = re.sub(r"[\s,>]+", "", line)
+    if together in answers:
+        return Typed("answer", answers[together])
+    parts = re.fullmatch(r"(\?|[a-z]+)\s*(\d{0,9})", line)
+    if parts is None:
+        return None
+    word, number = parts.groups()
+    for one in COMMANDS:
+        if one.key in commands and word in (one.key, one.word) and (one.key == "u" or not number):
+            return Typed(one.key, int(number) if number else None)
+    return None
+
+
+def hint(answers: list[dict[str, Any]], commands: Collection[str]) -> str:
+    """What can be typed, in few words."""
+    keys = keys_of(answers)
+    in_order = [one for one in answers if one["key"] is None and one["places"] is not None]
+    alone = [typed for typed in keys if keys[typed] not in {one["answer"] for one in in_order}]
+    parts = [", ".join(alone)] if alone else []
+    if in_order:
+        example = in_order[len(in_order) // 2]
+        letters = " ".join(ascii_lowercase[place] for place in example["places"])
+        parts.append(f"letters in order, as {letters} for {example['label']}")
+    for one in COMMANDS:
+        if one.key in commands:
+            parts.append(f"{one.word if one.key in keys else one.key} {one.short}")
+    return " · ".join(parts)

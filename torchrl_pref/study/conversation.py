@@ -28,7 +28,7 @@ from torchrl_pref.study.question_files import QuestionFiles
 from torchrl_pref.study.state import best_of_pool, label_of
 from torchrl_pref.study.study import Study
 from torchrl_pref.study.text_player import play
-from torchrl_pref.study.typed_lines import BESIDE, COMMANDS, hint, keys_of, understood
+from torchrl_pref.study.typed_lines import BESIDE, COMMANDS, TOGETHER, hint, keys_of, understood
 from torchrl_pref.tasks.scene import Scene
 
 Done = TypeVar("Done")
@@ -54,7 +54,7 @@ def say(text: str, before: str = "") -> None:
         break_long_words=False,
         break_on_hyphens=False,
     )
-    print("\n".join(wrapped))
+    print("\n".join(wrapped).replace(TOGETHER, " "))
 
 
 def rule(title: str) -> None:
@@ -247,7 +247,10 @@ class Conversation:
 
     def _show_learned(self, state: dict[str, Any]) -> None:
         """What has been learned so far, with the trajectory that is now thought best."""
-        print("\n".join(learned_as_text(state)))
+        weights, known = learned_as_text(state)
+        print("\n".join(["", *weights, ""]))
+        for sentence in known:
+            say(sentence)
         with self._study.turn():
             materials = self._study.materials
             scene = materials.scene(*best_of_pool(self._person, materials))

@@ -13,13 +13,17 @@ HALF = 15
 """Cells of a weight's bar to either side of zero."""
 
 
-def learned_as_text(state: dict[str, Any]) -> list[str]:
-    """What a state (:func:`state.state_of`) says of what has been learned, all but the drawing of
-    the best trajectory."""
+def learned_as_text(state: dict[str, Any]) -> tuple[list[str], list[str]]:
+    """What a state (:func:`state.state_of`) says of what has been learned.
+
+    Returns:
+        The rows of a table of the weights, and sentences.
+    """
     learned, answered = state["learned"], state["answered"]
-    rows = [f"Learned from {answered} {'answer' if answered == 1 else 'answers'}:", ""]
-    rows += weights_as_text(learned)
-    rows += ["", f"How well you are known: {100 * learned['sureness']:.0f} of 100."]
+    rows = [
+        f"Learned from {answered} {'answer' if answered == 1 else 'answers'}. "
+        f"How well you are known: {100 * learned['sureness']:.0f} of 100."
+    ]
     if learned["expected_gain"] is not None:
         rows.append(f"Your next answer is expected to add {100 * learned['expected_gain']:.2g}.")
     care = learned["rationality"]
@@ -33,7 +37,7 @@ def learned_as_text(state: dict[str, Any]) -> list[str]:
             f"Answer {one['number']} fits badly with the others (probability "
             f"{one['probability']:.2g}). If it was a slip, u {one['number']} takes it back."
         )
-    return rows
+    return weights_as_text(learned), rows
 
 
 def weights_as_text(learned: dict[str, Any]) -> list[str]:

@@ -13,6 +13,7 @@ from string import ascii_uppercase
 from typing import NamedTuple, TextIO
 
 from torchrl_pref.study.text_drawing import MARKS, Size, as_text, draw, ways_of
+from torchrl_pref.study.typed_lines import TOGETHER
 from torchrl_pref.tasks.scene import Label, Patch, Picture, Scene, corners
 
 GAP = 3
@@ -21,7 +22,7 @@ GAP = 3
 NARROWEST, WIDEST = 24, 44
 """Cells of a drawing across, where it is not higher than there is room for."""
 
-LOWEST, HIGHEST = 18, 32
+LOWEST, HIGHEST = 18, 40
 """Cells of a drawing up that there is always room for, and at most."""
 
 AROUND = 12
@@ -132,7 +133,7 @@ def bars_of(scene: Scene) -> list[Bar] | None:
 
 def printable(text: str) -> str:
     """A text without what a terminal would act upon."""
-    return "".join(one if one.isprintable() else "?" for one in text)
+    return "".join(one if one.isprintable() or one == TOGETHER else "?" for one in text)
 
 
 def _bar_row(bar: Bar, width: int) -> str:

@@ -10,6 +10,9 @@ from collections.abc import Collection, Mapping
 from string import ascii_lowercase
 from typing import Any, NamedTuple
 
+TOGETHER = "\N{NO-BREAK SPACE}"
+"""Keeps what can be typed in one line with what it does."""
+
 
 class Command(NamedTuple):
     """What can be typed beside answers."""
@@ -26,7 +29,7 @@ COMMANDS = (
     Command("r", "replay", "replay", "watch the options again"),
     Command("?", "s", "cannot say", "you cannot say; s is the same"),
     Command("u", "undo", "undo", "take an answer back; u 3 takes back the third"),
-    Command("w", "what", "what has been learned", "what has been learned so far"),
+    Command("w", "what", "learned so far", "what has been learned so far"),
     Command("h", "help", "help", "this list, and what you read before the first question"),
     Command("q", "quit", "stop", "stop here; you can go on later"),
 )
@@ -77,7 +80,7 @@ def understood(line: str, answers: Mapping[str, int], commands: Collection[str])
 
 
 def hint(answers: list[dict[str, Any]], commands: Collection[str]) -> str:
-    """What can be typed, in few words."""
+    """What can be typed, in few words, each of which keeps :data:`TOGETHER`."""
     keys = keys_of(answers)
     in_order = [one for one in answers if one["key"] is None and one["places"] is not None]
     alone = [typed for typed in keys if keys[typed] not in {one["answer"] for one in in_order}]
@@ -89,4 +92,4 @@ def hint(answers: list[dict[str, Any]], commands: Collection[str]) -> str:
     for one in COMMANDS:
         if one.key in commands:
             parts.append(f"{one.word if one.key in keys else one.key} {one.short}")
-    return " · ".join(parts)
+    return " · ".join(part.replace(" ", TOGETHER) for part in parts)

@@ -241,7 +241,6 @@ class Conversation:
         self._key = None
         rule(f"{state['answered']} answers")
         say(ENDS[state["end"]["reason"]])
-        print()
         self._show_learned(state)
         say(f"{hint([], BESIDE)} · Enter ends")
 
@@ -255,7 +254,8 @@ class Conversation:
             materials = self._study.materials
             scene = materials.scene(*best_of_pool(self._person, materials))
         say(f"The best of the pool is now thought to be {state['learned']['best_label']}:")
-        print("\n".join(options_as_text([scene], room_of(sys.stdout), letters="")))
+        room = room_of(sys.stdout)._replace(lines=0)  # no larger than it has to be
+        print("\n".join(options_as_text([scene], room, letters="")))
 
     def _help(self, answers: list[dict[str, Any]], commands: tuple[str, ...]) -> None:
         """What can be typed, and what people read before the first question."""

@@ -70,7 +70,7 @@ def _expected(study: Study) -> str:
     """Who may join."""
     named = study.materials.settings["study"]["participants"]
     if named is not None:
-        return f"expected one of {', '.join(named)}, as study.participants says"
+        return f"expected one of {', '.join(named)}, whom study.participants names"
     return (
         "expected a code of up to 32 letters, digits, - and _, as in participant=P1; a study that "
         "is full takes nobody new"

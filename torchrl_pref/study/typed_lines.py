@@ -81,14 +81,19 @@ def understood(line: str, answers: Mapping[str, int], commands: Collection[str])
 
 def hint(answers: list[dict[str, Any]], commands: Collection[str]) -> str:
     """What can be typed, in few words, each of which keeps :data:`TOGETHER`."""
-    keys = keys_of(answers)
+    keys, labels = keys_of(answers), {one["answer"]: one["label"] for one in answers}
     in_order = [one for one in answers if one["key"] is None and one["places"] is not None]
-    alone = [typed for typed in keys if keys[typed] not in {one["answer"] for one in in_order}]
-    parts = [", ".join(alone)] if alone else []
+    letters = [typed for typed, number in keys.items() if typed.upper() == labels[number]]
+    parts = [", ".join(letters)] if letters else []
+    parts += [
+        f"{one['key'] or one['answer'] + 1} {one['label']}"
+        for one in answers
+        if one not in in_order and one["label"].lower() not in letters
+    ]
     if in_order:
         example = in_order[len(in_order) // 2]
         letters = " ".join(ascii_lowercase[place] for place in example["places"])
-        parts.append(f"letters in order, as {letters} for {example['label']}")
+        parts.append(f"letters in order, as “{letters}” for {example['label']}")
     for one in COMMANDS:
         if one.key in commands:
             parts.append(f"{one.word if one.key in keys else one.key} {one.short}")

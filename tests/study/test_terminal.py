@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import io
+import os
+import pty
 import re
+import signal
+import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from itertools import chain
 from pathlib import Path
+from select import select
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 from PIL import Image
-from studies import answer_all, careful, materials_of, study_of
+from scripts import TIMEOUT
+from studies import CONF, SMALL, answer_all, careful, materials_of, study_of
 
 from torchrl_pref.errors import InputError
 from torchrl_pref.study import conversation, text_player
@@ -318,7 +324,7 @@ def test_enter_shows_the_question_again(
     types("", "  ")
     converse(study, "P1")
     first, second, third = capsys.readouterr().out.split("── Question 1")[1:]
-    assert first == second == third.removesuffix("\n")
+    assert first.strip() == second.strip() == third.strip()
     assert study.people["P1"].n_shown == 1
     study.close()
 
@@ -486,7 +492,8 @@ def test_what_has_been_learned_is_told(
     converse(study, "P1")
     out = capsys.readouterr().out
     for name, mean in zip(person.session.weights.names, person.session.weights.mean, strict=True):
-        assert re.search(rf"  {name} +{mean:+.2f} +[+-]0.\d\d … [+-]\d.\d\d .*●", out)
+        shown = re.escape(f"{mean:+.2f}")
+        assert re.search(rf"  {name} +{shown} +[+-]\d.\d\d … [+-]\d.\d\d .*●", out)
     assert "Learned from 15 answers. How well you are known: " in out
     assert "Your care is put at" in out
     assert f"Answer {slips[0]} fits badly with the others" in out
@@ -538,7 +545,7 @@ def test_the_question_is_there_as_pictures(
 
 def test_files_are_of_the_open_question_alone(tmp_path: Path) -> None:
     def scene(colour: str, n_frames: int) -> Scene:
-        frames = tuple((Disc((1.0 + step, 5.0), 4.0, colour),) for step in range(n_frames))
+        frames = tuple((Disc((5.0 + step, 5.0), 4.0, colour),) for step in range(n_frames))
         return Scene((0.0, 0.0), (10.0, 10.0), (), frames)
 
     files = QuestionFiles(tmp_path / "question")
@@ -608,7 +615,90 @@ def test_answers_without_letters_are_numbers() -> None:
     assert understood("3", keys, ALL) == Typed("answer", 2)
     assert understood("11", keys, ALL) == Typed("answer", 10)
     assert understood("12", keys, ALL) is None
-    assert hint(answers, ()).startswith("1, 2, 3")
+    can_be = hint(answers, ()).replace("\N{NO-BREAK SPACE}", " ")
+    assert can_be.startswith("1 0 stars · 2 1 stars · ")
+    assert can_be.endswith(" · 11 10 stars")
+
+
+def test_a_ranking_is_known_before_its_last_letter() -> None:
+    answers = possible_answers(materials_of("question=ranking", "pool.options=3"))
+    keys = keys_of(answers)
+    for line, label in {"b a": "B > A > C", "CBA": "C > B > A", "a>c>b": "A > C > B"}.items():
+        typed = understood(line, keys, ALL)
+        assert typed is not None
+        assert answers[typed.number or 0]["label"] == label
+    for line in ("b", "", ",", "b b", "b a a", "bacc"):
+        assert understood(line, keys, ALL) is None
+
+
+@pytest.fixture
+def run_in_terminal() -> Iterator[Callable[..., Any]]:
+    """What runs ask.py in a terminal of its own, and talks to it."""
+    talks = []
+
+    def run(*arguments: str) -> Talk:
+        talks.append(Talk(*arguments))
+        return talks[-1]
+
+    yield run
+    for one in talks:
+        one.end()
+
+
+class Talk:
+    """``python ask.py ui=terminal`` in a terminal of its own."""
+
+    def __init__(self, *arguments: str) -> None:
+        self._own, its = pty.openpty()
+        command = [sys.executable, str(CONF.parent / "ask.py"), "ui=terminal", *arguments]
+        environment = {**os.environ, "TERM": "xterm", "COLUMNS": "100", "LINES": "50"}
+        self.process = subprocess.Popen(
+            command, stdin=its, stdout=its, stderr=its, env=environment, start_new_session=True
+        )
+        os.close(its)
+
+    def until(self, text: str) -> str:
+        """What is printed until a text is."""
+        printed = b""
+        while text.encode() not in printed:
+            assert select([self._own], [], [], TIMEOUT)[0], printed.decode(errors="replace")
+            printed += os.read(self._own, 65536)  # fails where the program has ended
+        return printed.decode(errors="replace")
+
+    def type(self, text: str) -> None:
+        """Type something."""
+        os.write(self._own, text.encode())
+
+    def end(self) -> None:
+        """Kill it, where it has not ended."""
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait()
+        os.close(self._own)
+
+
+def test_the_script_in_a_terminal(tmp_path: Path, run_in_terminal: Callable[..., Talk]) -> None:
+    folder = tmp_path / "study"
+    talk = run_in_terminal(*SMALL, f"hydra.run.dir={folder}")
+    assert "\x1b[38;5;" in talk.until("> ")
+    talk.type("a\n")
+    talk.until("Question 2")
+    talk.until("> ")
+    talk.type("r\n")
+    assert talk.until("A┌").count("\n") > 10  # upward, and over it
+    talk.process.send_signal(signal.SIGINT)  # in the middle of it
+    last = talk.until("export: ")
+    assert "1 answers of 1 people" in last
+    assert "Traceback" not in last
+    assert talk.process.wait() == 0
+    again = run_in_terminal(f"resume={folder}")
+    assert "Question 2 of at most 6" in again.until("h help")
+    again.type("b\n")
+    again.until("Question 3")
+    again.until("> ")
+    again.process.send_signal(signal.SIGTERM)
+    assert "2 answers of 1 people" in again.until("stopped")
+    assert again.process.wait() == 128 + signal.SIGTERM
 
 
 def test_a_terminal_without_letters_to_draw_with_is_refused(

@@ -69,6 +69,9 @@ def understood(line: str, answers: Mapping[str, int], commands: Collection[str])
     together = re.sub(r"[\s,>]+", "", line)
     if together in answers:
         return Typed("answer", answers[together])
+    begun = [number for typed, number in answers.items() if typed.startswith(together)]
+    if len(begun) == 1:  # as of a ranking where one option is left, which is the last
+        return Typed("answer", begun[0])
     parts = re.fullmatch(r"(\?|[a-z]+)\s*(\d{0,9})", line)
     if parts is None:
         return None
@@ -81,20 +84,19 @@ def understood(line: str, answers: Mapping[str, int], commands: Collection[str])
 
 def hint(answers: list[dict[str, Any]], commands: Collection[str]) -> str:
     """What can be typed, in few words, each of which keeps :data:`TOGETHER`."""
-    keys, labels = keys_of(answers), {one["answer"]: one["label"] for one in answers}
-    in_order = [one for one in answers if one["key"] is None and one["places"] is not None]
-    letters = [typed for typed, number in keys.items() if typed.upper() == labels[number]]
-    parts = [", ".join(letters)] if letters else []
-    parts += [
-        f"{one['key'] or one['answer'] + 1} {one['label']}"
-        for one in answers
-        if one not in in_order and one["label"].lower() not in letters
-    ]
-    if in_order:
-        example = in_order[len(in_order) // 2]
-        letters = " ".join(ascii_lowercase[place] for place in example["places"])
-        parts.append(f"letters in order, as “{letters}” for {example['label']}")
-    for one in COMMANDS:
-        if one.key in commands:
-            parts.append(f"{one.word if one.key in keys else one.key} {one.short}")
+    keys = keys_of(answers)
+    letters, others, in_order = [], [], []
+    for typed, one in zip(keys, answers, strict=True):
+        if one["label"].lower() == typed:
+            letters.append(typed)
+        elif one["key"] is None and one["places"] is not None:
+            in_order.append(f"letters in order, as “{' '.join(typed)}” for {one['label']}")
+        else:
+            others.append(f"{typed} {one['label']}")
+    parts = [", ".join(letters)] * bool(letters) + others
+    parts += in_order[len(in_order) // 2 :][:1]  # one is enough, and not that of the order shown
+    for command in COMMANDS:
+        if command.key in commands:
+            key = command.word if command.key in keys else command.key
+            parts.append(f"{key} {command.short}")
     return " · ".join(part.replace(" ", TOGETHER) for part in parts)

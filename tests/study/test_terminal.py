@@ -543,6 +543,31 @@ def test_the_question_is_there_as_pictures(
         study.close()
 
 
+def test_each_letter_is_the_option_that_is_answered(
+    tmp_path: Path, types: Types, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_table(tmp_path)
+    study = study_of(tmp_path, *(one.format(tmp=tmp_path) for one in STUDIES["images"]))
+    orders = set()
+
+    def lines() -> Iterator[str]:
+        while (person := study.people["P1"]).shown is not None:
+            orders.add(person.shown.order)
+            out, raw = capsys.readouterr().out, study.materials.raw.trajectories
+            assert raw is not None
+            files = re.findall(r"  ([AB])  .*/(\d+)\.png", out)
+            options = [int(raw[person.shown.query, option]) for option in person.shown.order]
+            assert files == list(zip("AB", map(str, options), strict=True))
+            yield "b"
+
+    types(then=lines())
+    converse(study, "P1")
+    assert len(orders) == 2
+    for one in study.people["P1"].said:
+        assert one.answer == one.shown.order[1]
+    study.close()
+
+
 def test_files_are_of_the_open_question_alone(tmp_path: Path) -> None:
     def scene(colour: str, n_frames: int) -> Scene:
         frames = tuple((Disc((5.0 + step, 5.0), 4.0, colour),) for step in range(n_frames))

@@ -121,6 +121,15 @@ def test_options_are_beside_each_other_as_far_as_there_is_room(task: str, column
     assert [re.sub(r"\x1b\[[\d;]*m", "", row)[0] for row in coloured] == [row[0] for row in rows]
 
 
+def test_options_are_drawn_at_one_scale() -> None:
+    here = walk((1.0, 1.0), (9.0, 9.0))
+    wider = Scene((0.0, 0.0), (40.0, 10.0), (), here.frames)
+    scenes = at_one_scale([here, wider])
+    first, second = (options_as_text([scene], WIDE, letters="") for scene in scenes)
+    assert first == second
+    assert max(row.find("●") for row in first) < len(first[0]) / 4
+
+
 def test_features_are_rows_with_bars() -> None:
     names = ("speed", "a\x07 name that is much longer than there is room for")
     scenes = at_one_scale(

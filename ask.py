@@ -166,11 +166,12 @@ def way_to_ask(settings: Plain) -> Iterator[Callable[[Study], None]]:
     """What asks people, until somebody stops it.
 
     Raises:
-        InputError: nothing can be served at that address.
+        InputError: nothing can be served at that address, or drawn in this terminal.
     """
     if settings["ui"] == "terminal":
-        from torchrl_pref.study.terminal import converse
+        from torchrl_pref.study.terminal import check_letters, converse
 
+        check_letters()
         yield lambda study: converse(study, settings["participant"])
         return
     from torchrl_pref.study.serve import listening_at, serve

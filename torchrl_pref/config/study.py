@@ -124,6 +124,16 @@ SETUPS: dict[str, dict[str, Check]] = {
 """By setup; what is not checked is of simulations alone."""
 
 
+def _check_expected(settings: Plain) -> None:
+    """Refuse somebody in the terminal whom the study does not expect."""
+    person, named = settings["participant"], settings["study"]["participants"]
+    if settings["ui"] == "terminal" and named is not None and person not in named:
+        raise InputError(
+            f"participant={person}: expected one of {', '.join(named)}, whom study.participants "
+            "names"
+        )
+
+
 def check_ask_settings(settings: Plain) -> Plain:
     """Refuse what ask.py cannot do.
 
@@ -146,6 +156,7 @@ def check_ask_settings(settings: Plain) -> Plain:
             f"pool.size={pool['size']} with setup.budget={setup['budget']}: expected at least as "
             "many questions as are asked; raise one or lower the other"
         )
+    _check_expected(settings)
     check_belief(settings)
     if pool["file"] is None:
         check_options(settings)

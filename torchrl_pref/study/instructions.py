@@ -13,14 +13,24 @@ LARGEST = 100_000
 SYNTAX = ["heading", "list", "emphasis", "newline", "escape"]
 
 
+BREAKS = ("softbreak", "hardbreak")
+"""Lines of a paragraph end there; on a page it goes on."""
+
+
 def read_instructions(path: str | Path) -> list[dict[str, Any]]:
     """Headings, paragraphs and lists of a Markdown file; what else it marks is plain text.
 
     Raises:
-        InputError: the file cannot be read, or is no text, or too long.
+        InputError: the file cannot be read, or is no text, or too long; or what reads it is not
+            installed.
     """
-    from markdown_it import MarkdownIt  # an extra, like all of the page
-
+    try:
+        from markdown_it import MarkdownIt  # an extra, like all of the page
+    except ImportError:
+        raise InputError(
+            f"study.instructions={path}: markdown_it is not installed; install it by make ask, or "
+            "pip install -c constraints.txt -e '.[study]'"
+        ) from None
     try:
         text = Path(path).read_text(encoding="utf-8")
     except (OSError, ValueError) as error:
@@ -38,7 +48,8 @@ def read_instructions(path: str | Path) -> list[dict[str, Any]]:
         elif token.type.endswith("_close"):
             inside.pop()
         elif token.type == "inline":
-            text = "".join(part.content or " " for part in token.children or [])
+            parts = token.children or []
+            text = "".join(" " if part.type in BREAKS else part.content for part in parts)
             _add(blocks, inside, " ".join(text.split()))
     return blocks
 

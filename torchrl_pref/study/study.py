@@ -108,18 +108,23 @@ class Study:
             with self._counting:
                 self._in_line -= 1
 
+    def may_join(self, code: str) -> bool:
+        """Whether somebody may be called that: who is known, or anybody new that is expected."""
+        if code in self.people:
+            return True
+        named = self.materials.settings["study"]["participants"]
+        expected = CODE.fullmatch(code) and (named is None or code in named)
+        return bool(expected) and len(self.people) < MOST_PARTICIPANTS
+
     def join(self, code: str) -> Participant | None:
         """The participant of a code, who may be new; None where nobody may be called that.
 
         Raises:
             LogError: it cannot be written.
         """
+        if not self.may_join(code):
+            return None
         if code not in self.people:
-            named = self.materials.settings["study"]["participants"]
-            if not CODE.fullmatch(code) or (named is not None and code not in named):
-                return None
-            if len(self.people) >= MOST_PARTICIPANTS:
-                return None
             person = Participant(code, self.materials, self.log, self._common)
             self.log.append(code, "joined", self._common, f"{code} joined")
             self.people[code] = person

@@ -23,15 +23,14 @@ from scripts import TIMEOUT
 from studies import CONF, SMALL, answer_all, careful, materials_of, study_of
 
 from torchrl_pref.errors import InputError
-from torchrl_pref.study import conversation, text_player
 from torchrl_pref.study.log import Log, LogError
-from torchrl_pref.study.options_text import Room
 from torchrl_pref.study.participant import ATTENTION, Participant
-from torchrl_pref.study.question_files import QuestionFiles
 from torchrl_pref.study.state import possible_answers
 from torchrl_pref.study.study import Study
-from torchrl_pref.study.terminal import converse
-from torchrl_pref.study.typed_lines import COMMANDS, Typed, hint, keys_of, understood
+from torchrl_pref.study.terminal import conversation, converse, player
+from torchrl_pref.study.terminal.files import QuestionFiles
+from torchrl_pref.study.terminal.lines import COMMANDS, Typed, hint, keys_of, understood
+from torchrl_pref.study.terminal.options import Room
 from torchrl_pref.tasks.scene import Disc, Scene
 
 OMEGA = torch.tensor([0.5, -0.5, 0.5, 0.5])
@@ -596,22 +595,22 @@ def test_a_replay_is_drawn_over_itself(
     frames = tuple((Disc((1.0 + step, 5.0), 0.5),) for step in range(5))
     scenes = [Scene((0.0, 0.0), (10.0, 10.0), (), frames)] * 2
     slept: list[float] = []
-    monkeypatch.setattr(text_player.time, "sleep", slept.append)
-    text_player.play(scenes, Room(80, 50, 0), "AB")
+    monkeypatch.setattr(player.time, "sleep", slept.append)
+    player.play(scenes, Room(80, 50, 0), "AB")
     printed = capsys.readouterr().out
     assert re.findall(r"moment (\d) of 5", printed) == ["1", "2", "4", "5"]
     assert "\x1b" not in printed
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
-    text_player.play(scenes, Room(80, 50, 0), "AB")
+    player.play(scenes, Room(80, 50, 0), "AB")
     rows = capsys.readouterr().out
     high = rows.split("\x1b")[0].count("\n")
     assert rows.count(f"\x1b[{high}A") == rows.count("\x1b") == 4
     assert len(slept) == 5
-    text_player.play(scenes, Room(30, 24, 0), "AB")  # one after the other
+    player.play(scenes, Room(30, 24, 0), "AB")  # one after the other
     rows = capsys.readouterr().out
     assert rows.count("─ A ─") == rows.count("─ B ─") == 5
     assert rows.index("─ B ─") > rows.rindex("─ A ─")
-    text_player.play(scenes, Room(30, 5, 0), "AB")  # nothing fits
+    player.play(scenes, Room(30, 5, 0), "AB")  # nothing fits
     assert "\x1b" not in capsys.readouterr().out
 
 

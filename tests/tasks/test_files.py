@@ -65,7 +65,7 @@ def test_queries_stay_as_they_are(tmp_path: Path) -> None:
 
 
 def test_too_few_for_a_pool(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="too few"):
+    with pytest.raises(InputError, match="are left for one of the two"):
         make_pool(FilesTask(str(write_csv(tmp_path / "x.csv", 3))).split(0)[1], 10, 2, seed=0)
 
 

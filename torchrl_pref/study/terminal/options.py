@@ -12,8 +12,8 @@ from dataclasses import replace
 from string import ascii_uppercase
 from typing import NamedTuple, TextIO
 
-from torchrl_pref.study.text_drawing import MARKS, Size, as_text, draw, ways_of
-from torchrl_pref.study.typed_lines import TOGETHER
+from torchrl_pref.study.terminal.drawing import MARKS, Size, as_text, draw, ways_of
+from torchrl_pref.study.terminal.lines import TOGETHER
 from torchrl_pref.tasks.scene import Label, Patch, Picture, Scene, corners
 
 GAP = 3

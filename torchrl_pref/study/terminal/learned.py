@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from torchrl_pref.study.options_text import WIDEST_NAME, printable
+from torchrl_pref.study.terminal.options import WIDEST_NAME, printable
 
 HALF = 15
 """Cells of a weight's bar to either side of zero."""

@@ -10,7 +10,8 @@ import pytest
 import torch
 from studies import materials_of
 
-from torchrl_pref.study.options_text import (
+from torchrl_pref.study.terminal.drawing import COLOURS, Cell, Size, as_text, draw, ways_of
+from torchrl_pref.study.terminal.options import (
     Room,
     at_one_scale,
     bars_of,
@@ -18,8 +19,7 @@ from torchrl_pref.study.options_text import (
     options_as_text,
     room_of,
 )
-from torchrl_pref.study.text_drawing import COLOURS, Cell, Size, as_text, draw, ways_of
-from torchrl_pref.study.text_player import steps_of
+from torchrl_pref.study.terminal.player import steps_of
 from torchrl_pref.tasks.base import feature_bars
 from torchrl_pref.tasks.scene import Disc, Label, Line, Patch, Picture, Scene, Shape
 

@@ -9,10 +9,10 @@ from __future__ import annotations
 import sys
 
 from torchrl_pref.errors import InputError
-from torchrl_pref.study.conversation import Conversation, instruct, say, surely
 from torchrl_pref.study.participant import Participant
-from torchrl_pref.study.question_files import QuestionFiles
 from torchrl_pref.study.study import Study
+from torchrl_pref.study.terminal.conversation import Conversation, instruct, say, surely
+from torchrl_pref.study.terminal.files import QuestionFiles
 
 FOLDER = "question"
 """In the folder of a study: the open question as files."""

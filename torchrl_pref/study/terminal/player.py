@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Sequence
 
-from torchrl_pref.study.options_text import Room, options_as_text
+from torchrl_pref.study.terminal.options import Room, options_as_text
 from torchrl_pref.tasks.scene import Scene
 
 SECONDS = 4.0

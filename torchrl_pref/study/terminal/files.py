@@ -14,7 +14,7 @@ from pathlib import Path
 from string import ascii_uppercase
 
 from torchrl_pref.errors import one_line
-from torchrl_pref.study.options_text import bars_of, files_of
+from torchrl_pref.study.terminal.options import bars_of, files_of
 from torchrl_pref.tasks.scene import Scene
 
 

@@ -14,21 +14,21 @@ from pathlib import Path
 from string import ascii_uppercase
 from typing import Any, TypeVar
 
-from torchrl_pref.study.learned_text import learned_as_text
 from torchrl_pref.study.log import LogError
-from torchrl_pref.study.options_text import (
+from torchrl_pref.study.participant import Participant
+from torchrl_pref.study.state import best_of_pool, label_of
+from torchrl_pref.study.study import Study
+from torchrl_pref.study.terminal.files import QuestionFiles
+from torchrl_pref.study.terminal.learned import learned_as_text
+from torchrl_pref.study.terminal.lines import BESIDE, COMMANDS, TOGETHER, hint, keys_of, understood
+from torchrl_pref.study.terminal.options import (
     at_one_scale,
     marks_of,
     options_as_text,
     printable,
     room_of,
 )
-from torchrl_pref.study.participant import Participant
-from torchrl_pref.study.question_files import QuestionFiles
-from torchrl_pref.study.state import best_of_pool, label_of
-from torchrl_pref.study.study import Study
-from torchrl_pref.study.text_player import play
-from torchrl_pref.study.typed_lines import BESIDE, COMMANDS, TOGETHER, hint, keys_of, understood
+from torchrl_pref.study.terminal.player import play
 from torchrl_pref.tasks.scene import Scene
 
 Done = TypeVar("Done")

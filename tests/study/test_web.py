@@ -40,6 +40,18 @@ def body_of(state: dict[str, Any], answer: Any = 0, **other: Any) -> dict[str, A
     return {**body, "seconds": 1.5, "replays": 1, **other}
 
 
+def test_nobody_begins_without_their_consent(tmp_path: Path) -> None:
+    study = study_of(tmp_path, "study.consent=true")
+    client = client_of(study)
+    for more in ({}, {"consent": False}, {"consent": 1}, {"consent": "true"}):
+        assert client.post("/api/join", json={"code": "P1", **more}).status_code == 403
+    assert not study.people
+    assert client.post("/api/join", json={"code": "P1", "consent": True}).status_code == 200
+    assert client.post("/api/join", json={"code": "P1"}).status_code == 200  # as after a reload
+    assert [e.content["consented"] for e in study.log.events() if e.kind == "joined"] == [True]
+    study.close()
+
+
 def test_a_person_answers_and_sees_what_was_learned(study: Study, client: TestClient) -> None:
     about = client.get("/api/study").json()
     assert about == {

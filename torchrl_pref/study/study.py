@@ -116,8 +116,13 @@ class Study:
         expected = CODE.fullmatch(code) and (named is None or code in named)
         return bool(expected) and len(self.people) < MOST_PARTICIPANTS
 
+    def lacks_consent(self, code: str) -> bool:
+        """Whether somebody has to say that they agree, before they can begin."""
+        return code not in self.people and bool(self.materials.settings["study"]["consent"])
+
     def join(self, code: str) -> Participant | None:
-        """The participant of a code, who may be new; None where nobody may be called that.
+        """The participant of a code, who may be new, and then has agreed where they have to; None
+        where nobody may be called that.
 
         Raises:
             LogError: it cannot be written.
@@ -126,7 +131,8 @@ class Study:
             return None
         if code not in self.people:
             person = Participant(code, self.materials, self.log, self._common)
-            self.log.append(code, "joined", self._common, f"{code} joined")
+            content = {**self._common, "consented": self.lacks_consent(code)}
+            self.log.append(code, "joined", content, f"{code} joined")
             self.people[code] = person
         return self.people[code]
 

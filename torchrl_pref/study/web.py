@@ -238,7 +238,10 @@ def _about(study: Study, said: dict[str, Any]) -> dict[str, Any]:
 
 
 def _join(study: Study, said: dict[str, Any]) -> Participant:
-    person = study.join(_field(said, "code", (str,)))
+    code = _field(said, "code", (str,))
+    if study.may_join(code) and study.lacks_consent(code) and said.get("consent") is not True:
+        raise Refused(403, "Nobody can begin who has not agreed to take part.")
+    person = study.join(code)
     if person is None:
         raise Refused(
             404,

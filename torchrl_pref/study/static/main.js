@@ -78,11 +78,11 @@ async function resume(code) {
     if (pending.code === code) await surely(() => post("/api/answer", pending));
     kept.removeItem("answer");
   }
-  await join(code);
+  await join(code, false);
 }
 
-async function join(code) {
-  const { status, content } = await surely(() => post("/api/join", { code }));
+async function join(code, consent) {
+  const { status, content } = await surely(() => post("/api/join", { code, consent }));
   if (status === 200) {
     kept.setItem("code", code);
     show(content);
@@ -118,7 +118,7 @@ function welcome() {
       "I have read this, and I agree to take part."));
   const form = element("form", { onsubmit: (event) => {
     event.preventDefault();
-    join(code.value);
+    join(code.value, study.consent); // which the form asks for
   } },
   element("label", { htmlFor: "code" }, "Your code"), code,
   element("small", { id: "code-help" }, help), consent,

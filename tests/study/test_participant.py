@@ -17,7 +17,8 @@ from torchrl_pref.humans.simulated import SimulatedHuman
 from torchrl_pref.questions.base import reordered
 from torchrl_pref.session import PRIME
 from torchrl_pref.strategies import STRATEGIES
-from torchrl_pref.study.participant import ATTENTION, QUESTION, REPEAT, Participant
+from torchrl_pref.study.participant import Participant
+from torchrl_pref.study.shown import ATTENTION, QUESTION, REPEAT
 from torchrl_pref.study.state import doubtful_answers, label_of, possible_answers, state_of
 from torchrl_pref.study.study import Study
 

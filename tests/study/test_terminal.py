@@ -24,7 +24,8 @@ from studies import CONF, SMALL, answer_all, careful, materials_of, study_of
 
 from torchrl_pref.errors import InputError
 from torchrl_pref.study.log import Log, LogError
-from torchrl_pref.study.participant import ATTENTION, Participant
+from torchrl_pref.study.participant import Participant
+from torchrl_pref.study.shown import ATTENTION
 from torchrl_pref.study.state import possible_answers
 from torchrl_pref.study.study import Study
 from torchrl_pref.study.terminal import conversation, converse, player

@@ -16,7 +16,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from torchrl_pref.errors import InputError
-from torchrl_pref.study.participant import ATTENTION, REPEAT, Participant
+from torchrl_pref.study.participant import Participant
+from torchrl_pref.study.shown import ATTENTION, REPEAT
 from torchrl_pref.study.state import best_of_pool, doubtful_answers, label_of
 from torchrl_pref.study.study import Study
 from torchrl_pref.tasks.drawing import picture_of

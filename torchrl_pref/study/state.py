@@ -12,8 +12,9 @@ import torch
 
 from torchrl_pref.questions.base import answers_on
 from torchrl_pref.study.materials import Materials
-from torchrl_pref.study.participant import ATTENTION, QUESTION, Participant, Said, Shown
+from torchrl_pref.study.participant import Participant
 from torchrl_pref.study.scenes import Pictures, scene_as_json
+from torchrl_pref.study.shown import ATTENTION, QUESTION, Said, Shown
 
 DOUBTFUL = 0.5
 """An answer fits the rest badly if it is less probable than this share of one by chance."""

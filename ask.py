@@ -30,7 +30,10 @@ if TYPE_CHECKING:
 CONFIG, POOL, LOG = "config.yaml", "pool.pt", "study.db"
 """The files of a study; with the log it has begun."""
 
-BESIDE_RESUME = ("ui", "participant", "host", "port", "open", "threads")
+OF_THE_MACHINE = ("host", "port", "open", "threads")
+"""Of each start: a study that was served to others once is not because of that served again."""
+
+BESIDE_RESUME = ("ui", "participant", *OF_THE_MACHINE)
 """What may be typed beside ``resume``: it leaves a study what it is."""
 
 
@@ -69,7 +72,7 @@ def check(settings: Plain) -> Plain:
         from torchrl_pref.groups import allow
 
         allow(settings["strategy"])
-    if settings["ui"] == "browser" and settings["export"] is None:
+    elif settings["ui"] == "browser":
         check_installed()
     return checked
 
@@ -100,7 +103,7 @@ def begin(folder: Path, settings: Plain) -> None:
         )
     from torchrl_pref.study.materials import draw_pool, make_materials
 
-    with runs.claimed(folder), way_to_ask(settings) as ask:
+    with runs.claimed(folder), way_to_ask(folder, settings) as ask:
         app.use_threads(settings)
         raw = draw_pool(settings)
         materials = make_materials(settings, raw)  # or it is refused, before anything is written
@@ -112,8 +115,11 @@ def begin(folder: Path, settings: Plain) -> None:
 def go_on(folder: Path, typed_now: Plain) -> None:
     """A study that has begun, with its own settings."""
     settings = load_settings("resume", folder)
+    settings |= {key: typed_now[key] for key in OF_THE_MACHINE}
     settings |= {key: typed_now[key] for key in BESIDE_RESUME if typed.was_typed(key)}
-    with runs.claimed(folder), way_to_ask(settings) as ask:
+    if settings["ui"] == "browser":
+        check_installed()
+    with runs.claimed(folder), way_to_ask(folder, settings) as ask:
         app.use_threads(settings)
         run(load_study(folder, settings), ask)
 
@@ -162,7 +168,7 @@ def make_study(folder: Path, materials: Materials) -> Study:
 
 
 @contextmanager
-def way_to_ask(settings: Plain) -> Iterator[Callable[[Study], None]]:
+def way_to_ask(folder: Path, settings: Plain) -> Iterator[Callable[[Study], None]]:
     """What asks people, until somebody stops it.
 
     Raises:
@@ -177,7 +183,7 @@ def way_to_ask(settings: Plain) -> Iterator[Callable[[Study], None]]:
     from torchrl_pref.study.serve import listening_at, serve
 
     host = settings["host"]
-    with listening_at(host, settings["port"]) as listening:
+    with listening_at(folder, host, settings["port"]) as listening:
         yield lambda study: serve(study, listening, host, settings["open"])
 
 
@@ -187,10 +193,16 @@ def run(study: Study, ask: Callable[[Study], None]) -> None:
         ask(study)
     finally:
         study.close()
-        n_answers = sum(len(person.said) for person in study.people.values())
-        print(f"{n_answers} answers of {len(study.people)} people are in {study.folder}")
+        answers = counted(sum(len(one.said) for one in study.people.values()), "answer")
+        people = counted(len(study.people), "person", "people")
+        print(f"{answers} of {people} in {study.folder}")
         print(f"go on:  {app.command(app.as_typed('resume', study.folder))}")
         print(f"export: {app.command(app.as_typed('export', study.folder))}")
+
+
+def counted(number: int, one: str, many: str | None = None) -> str:
+    """A number with what it counts."""
+    return f"{number} {one if number == 1 else many or one + 's'}"
 
 
 def export(folder: Path) -> None:
@@ -198,6 +210,7 @@ def export(folder: Path) -> None:
     from torchrl_pref.study.export import export_study
 
     settings = load_settings("export", folder)
+    print("one moment …", flush=True)
     app.use_threads(settings)
     study = load_study(folder, settings)  # people may go on answering meanwhile
     try:

@@ -3,7 +3,7 @@
 For each of three tasks ``ask.py`` serves a study, and people with a reward of their own press keys
 as Boltzmann humans. They see what the page shows, in its order. Beside their alignment after 20
 answers stands that of many simulated humans in one batch, with the same pool, belief and policy:
-a mean of so few people should lie within its interval.
+a mean of so few people should lie within its interval, or the exit status is 1.
 """
 
 from __future__ import annotations
@@ -111,7 +111,9 @@ def at_page(browser: Browser, link: str, folder: Path, materials: Materials, num
         done = f"Question {turn + 2} " if turn + 1 < BUDGET else f"{BUDGET} answers"
         browser.until(lambda done=done: done in browser.text("#count"))
     log.close()
-    samples = ask.load_study(folder, materials.settings).people[code].session.samples
+    study = ask.load_study(folder, materials.settings)
+    samples = study.people[code].session.samples
+    study.close()
     return float(alignment(samples, one["omega"][0]))
 
 
@@ -208,6 +210,7 @@ def main() -> None:
             else:
                 rows = list(compare(browser, typed, Path(scratch)))
                 report("Alignment after 20 answers by keys in Chromium", rows, typed.json)
+                raise SystemExit(any(row["within"] == "NO" for row in rows))
     finally:
         browser.close()
 

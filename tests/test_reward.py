@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from torchrl.envs.utils import check_env_specs
 
 from torchrl_pref import Boltzmann, Normalizer, QueryPool, Reward, Session
 from torchrl_pref.errors import InputError
+from torchrl_pref.reward import LARGEST
 
 NAMES = ("speed", "closeness", "jerk")
 
@@ -98,6 +100,9 @@ def changed(path: Path, **parts: Any) -> None:
 
 SPOILED: dict[str, tuple[Callable[[Path], Any], str]] = {
     "missing": (lambda path: path.unlink(), "no such file"),
+    "folder": (lambda path: (path.unlink(), path.mkdir()), "is a folder"),
+    "pipe": (lambda path: (path.unlink(), os.mkfifo(path)), "is a device or a pipe"),
+    "large": (lambda path: os.truncate(path, LARGEST + 1), "larger than any reward"),
     "cut": (lambda path: path.write_text(path.read_text()[:90]), "cannot be read as a reward"),
     "binary": (lambda path: path.write_bytes(b"\xff\xfe\x00"), "cannot be read as a reward"),
     "deep": (lambda path: path.write_text("[" * 200_000), "cannot be read as a reward"),
@@ -145,6 +150,8 @@ def test_what_is_no_reward_or_no_features_is_refused(
         InputError, match=r"features of \(4,\): expected a tensor \(…, 3\) of speed"
     ):
         Reward.of(session).score(torch.zeros(4))
+    with pytest.raises(InputError, match="features: NaN"):
+        Reward.of(session).score(torch.tensor([[1.0, math.nan, 3.0]]))
     with pytest.raises(InputError, match="features of <class 'list'>"):
         Reward.of(session).score([1.0, 2.0, 3.0])
     with pytest.raises(InputError, match="cannot be written"):

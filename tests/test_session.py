@@ -296,8 +296,8 @@ def test_a_feed_shows_what_the_environment_would(strategy: str) -> None:
         module = pretrained_policy(env, "noisy").strategy
     else:
         module = FEED_STRATEGIES[strategy](env)
-    offers = Generator().manual_seed(3)
-    stream = torch.randint(300, (1, 25), generator=offers)
+    keys = torch.rand(1, 300, generator=Generator().manual_seed(3))
+    stream = keys.argsort(-1)[:, :25]  # so that nothing streams by twice
     luck = Generator().manual_seed(3)
     state = begin(Belief(MODEL).prior(1, 4, luck), 6, 2)
     place, n_told = 0, 0
@@ -319,6 +319,24 @@ def test_a_feed_shows_what_the_environment_would(strategy: str) -> None:
         assert place == 6
     again = Session.from_dict(session.to_dict(), pool, MODEL, strategy)
     assert again.to_dict() == session.to_dict()
+
+
+def test_a_question_of_a_feed_that_is_only_looked_at_does_not_go_by() -> None:
+    pool = torch.rand(300, 2, 4, generator=Generator().manual_seed(0))
+    session = Session(pool, MODEL, "alignment_gain", budget=6, setup="feed", seed=3)
+    for _ in range(3):
+        session.ask()
+        session.tell(0)
+    looked = session.branch()
+    looked.ask()
+    restored = Session.from_dict(looked.to_dict(), pool, MODEL, "alignment_gain")
+    assert restored.n_offered == looked.n_offered > session.n_offered
+    for one in (session, looked, restored):
+        one.undo(1)
+        one.ask()
+        one.tell(1)
+        one.ask()
+    assert session.to_dict() == looked.to_dict() == restored.to_dict()
 
 
 def test_a_feed_ends_with_its_offers() -> None:

@@ -56,6 +56,19 @@ def make_env(
     return FeedEnv(pool, nobody, belief, offers=options["offers"], skip="free", **common)
 
 
+def draw_questions(env: QueryEnv | FeedEnv, size: int, repeats: bool) -> dict[str, Tensor]:
+    """What streams by of a feed, for B people: hidden. See :meth:`SessionEnv.draw_questions`.
+
+    Without ``repeats`` a query comes again only after all others.
+    """
+    if repeats or not isinstance(env, FeedEnv):
+        return env.draw_questions(size)
+    n_queries = len(env.features)
+    n_passes = -(-env.n_offers // n_queries)
+    keys = torch.rand((size, n_passes, n_queries), generator=env.generator)
+    return {"offers": keys.argsort(-1).flatten(1)[:, : env.n_offers]}
+
+
 def strategy_of(strategy: str | MakeStrategy, env: EnvBase) -> TensorDictModuleBase:
     """What asks in an environment.
 

@@ -125,7 +125,7 @@ class Learned:
             raise InputError(
                 f"features of shape {tuple(features.shape)}: expected (n, {self.pool.n_features})"
             )
-        mean, deviation = scores(directions(self._states[-1]["samples"]), features)
+        mean, deviation = scores(directions(self._states[-1]["samples"]), features.float())
         return self._plain(mean), self._plain(deviation)
 
     def _plain(self, tensor: Tensor) -> Tensor:

@@ -19,8 +19,9 @@ from torchrl.envs import Transform
 from torchrl_pref.errors import InputError
 from torchrl_pref.learned import Learned, Weights, scores, summary
 from torchrl_pref.pool import Normalizer
+from torchrl_pref.storage.files import size_of
 from torchrl_pref.storage.writing import write_text
-from torchrl_pref.tensors import check_names, directions
+from torchrl_pref.tensors import check_finite, check_names, directions
 
 FORMAT = 1
 """Of the file."""
@@ -83,7 +84,7 @@ class Reward(Transform):
         if not samples.isfinite().all() or not samples.any(-1).all():
             raise InputError("samples: expected finite numbers, not all 0 in any of them")
         self.feature_names = check_names(feature_names, samples.shape[1])
-        self.origin = dict(origin or {})
+        self.origin = check_origin(dict(origin or {}))
         self.features = features
         self.register_buffer("samples", directions(samples.detach().float()))
         self.register_buffer("mean", normalizer.mean.detach().float())
@@ -128,9 +129,10 @@ class Reward(Transform):
             (…) and (…), mean and standard deviation over the samples.
 
         Raises:
-            InputError: the features are not (… D) numbers.
+            InputError: the features are not (… D) finite numbers.
         """
         self._check(features)
+        check_finite("features", features)
         mean, deviation = scores(
             self.samples, self._normalised(features.reshape(-1, features.shape[-1]))
         )
@@ -159,7 +161,13 @@ class Reward(Transform):
         if callable(self.features):
             features = self.features(tensordict, next_tensordict)
         else:
-            features = next_tensordict.get(self.features)
+            features = next_tensordict.get(self.features, None)
+            if features is None:
+                raise InputError(
+                    f"features={self.features!r}: a step has no such key; give the key of its "
+                    "features, or a function of what is before and after it, as in "
+                    "Reward.load(path, features=describe)"
+                )
         self._check(features)
         reward = self._normalised(features) @ self.samples.mean(0)
         return next_tensordict.set("reward", reward.unsqueeze(-1))
@@ -218,7 +226,8 @@ class Reward(Transform):
             if mean.shape != std.shape or mean.ndim != 1 or not (std > 0).all():
                 raise InputError("normalizer: expected D means and D deviations above 0")
             names = check_names(content.get("feature_names"), len(mean))
-            made = cls(samples, Normalizer(mean, std), names, features, _origin(content))
+            origin = check_origin(content.get("origin"))
+            made = cls(samples, Normalizer(mean, std), names, features, origin)
             for name in SHOWN:
                 told, found = _numbers(content, "weights", name), getattr(made.weights, name)
                 if told.shape != found.shape or not torch.allclose(told, found, atol=1e-4):
@@ -238,12 +247,10 @@ def _read(path: Path) -> dict[str, Any]:
     Raises:
         InputError: it cannot be read, or is no reward.
     """
+    if size_of(path, "reward") > LARGEST:
+        raise InputError(f"{path}: larger than any reward; expected what Reward.save wrote")
     try:
-        if path.stat().st_size > LARGEST:
-            raise InputError(f"{path}: larger than any reward; expected what Reward.save wrote")
         content = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; check the path") from None
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(
             f"{path}: cannot be read as a reward ({error}); expected what Reward.save wrote"
@@ -269,27 +276,23 @@ def _numbers(content: dict[str, Any], *keys: str) -> Tensor:
         found = found.get(key) if isinstance(found, dict) else None
     try:
         tensor = torch.tensor(found, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError):
+    except (TypeError, ValueError, RuntimeError, OverflowError):
         raise InputError(f"{'.'.join(keys)}: expected lists of numbers") from None
     if not tensor.float().isfinite().all():
         raise InputError(f"{'.'.join(keys)}: expected finite numbers")
     return tensor.float()
 
 
-def _origin(content: dict[str, Any]) -> dict[str, str | int]:
-    """The facts of where a reward comes from.
+def check_origin(found: Any) -> dict[str, str | int]:
+    """Return the facts of where a reward comes from.
 
     Raises:
-        InputError: they are none.
+        InputError: they are none, or too many, or too long.
     """
-    found = content.get("origin")
     if not isinstance(found, dict) or len(found) > MOST_ORIGINS:
         raise InputError(f"origin: expected at most {MOST_ORIGINS} facts by name")
     for name, fact in found.items():
-        if (
-            type(fact) not in (str, int)
-            or len(str(fact)) > LONGEST_ORIGIN
-            or len(name) > LONGEST_ORIGIN
-        ):
+        plain = type(name) is str and type(fact) in (str, int)
+        if not plain or len(name) > LONGEST_ORIGIN or len(str(fact)) > LONGEST_ORIGIN:
             raise InputError(f"origin.{name!s:.40}: expected a short text or a whole number")
     return found

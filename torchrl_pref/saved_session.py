@@ -9,7 +9,7 @@ from torchrl_pref.errors import InputError
 FORMAT = 1
 """Of what ``Session.to_dict`` makes."""
 
-EARLIER = {"given": None, "setup": "query", "offers": None, "offered": None}
+EARLIER = {"given": None, "setup": "query", "offers": None, "offered": None, "gone": None}
 """What sessions of earlier versions do not say of themselves."""
 
 
@@ -43,6 +43,7 @@ def check_content(content: Any) -> None:
         "setup": lambda value: value in ("query", "feed"),
         "offers": lambda value: value is None or type(value) is int,
         "offered": lambda value: value is None or numbers(value),
+        "gone": lambda value: value is None or numbers(value),
     }
     if not isinstance(content, dict):
         raise InputError(f"a session of type {type(content).__name__}: expected a dict")

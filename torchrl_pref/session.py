@@ -17,6 +17,7 @@ from torchrl_pref.asking import (
     Asked,
     NothingToAsk,
     check_same,
+    draw_questions,
     make_env,
     next_question,
     strategy_of,
@@ -72,7 +73,8 @@ class Session(Learned):
             ``questions.prior_evidence``: demonstrations and corrections, normalised as the pool.
         setup: ``query``, in which the strategy chooses from the whole pool; or ``feed``, in which
             queries of the pool stream by and people see those that it lets through.
-        offers: O, how many stream by at most; None is 5H.
+        offers: O, how many stream by at most; None is 5H. With ``repeats`` off all queries stream
+            by before one comes again.
 
     Raises:
         InputError: something is not what it should be.
@@ -113,7 +115,7 @@ class Session(Learned):
         options = {"budget": budget, "repeats": repeats, "offers": offers}
         self._env = make_env(self.pool, belief, setup, size, seed, **options)
         self._belief, self._strategy = belief, strategy_of(strategy, self._env)
-        self._hidden = self._env.draw_questions(size)
+        self._hidden = draw_questions(self._env, size, repeats)
         luck, n_features = Generator().manual_seed(self.seed), self.pool.n_features
         state = begin(belief.prior(size, n_features, luck), budget, self.pool.n_options)
         given = check_given(given)
@@ -123,7 +125,8 @@ class Session(Learned):
         self._states, self._given = [state], given_digest(given)
         self._turns: list[Turn] = []
         self._asked: Tensor | None = None
-        self._n_offered = torch.zeros(size, 1, dtype=torch.long)
+        # Offers that went by, until the present question and until the one that was answered last.
+        self._n_offered = self._n_gone = torch.zeros(size, 1, dtype=torch.long)
 
     @property
     def answers(self) -> tuple[str, ...]:
@@ -143,11 +146,11 @@ class Session(Learned):
                     f"budget={self.budget}: all questions are answered; expected a larger budget "
                     "where more are to be asked"
                 )
-            state: SessionState = {**self._states[-1], "n_offered": self._n_offered}
+            state: SessionState = {**self._states[-1], "n_offered": self._n_gone}
             asked, offered = next_question(
                 self._env, self._strategy, state, self._hidden, self._luck
             )
-            self._asked, self._n_offered = asked, self._n_offered if offered is None else offered
+            self._asked, self._n_offered = asked, self._n_gone if offered is None else offered
         index, shown_to = self._asked, self.pool.trajectories
         trajectories = None if shown_to is None else self._plain(shown_to[index])
         return Asked(self._plain(index), self._plain(self.pool.features[index]), trajectories)
@@ -180,6 +183,7 @@ class Session(Learned):
         if not isinstance(given, Sequence):
             raise InputError(f"answer={answer!s:.60}: expected a list, one for each person")
         self._let_in(Turn(self._asked, self._said(given)))
+        self._n_gone = self._n_offered
 
     def put(self, query: int | Sequence[int], n_offered: int | None = None) -> None:
         """Ask this question of the pool next, and not the one that the strategy would choose.
@@ -194,10 +198,9 @@ class Session(Learned):
         if self.n_answered >= self.budget:
             raise NothingToAsk(f"budget={self.budget}: all questions are answered")
         self._asked = self._index_of([query] if isinstance(query, int) else list(query))
+        self._n_offered = self._n_gone
         if n_offered is not None:
-            self._n_offered = torch.full_like(
-                self._n_offered, check_count("n_offered", n_offered, 0)
-            )
+            self._n_offered = torch.full_like(self._n_gone, check_count("n_offered", n_offered, 0))
 
     @property
     def n_offered(self) -> int:
@@ -223,7 +226,7 @@ class Session(Learned):
         del self._states[place + 1 :], self._turns[place:]
         for one in later:
             self._let_in(one)
-        self._asked = again.query
+        self._asked, self._n_offered = again.query, self._n_gone
 
     def branch(self) -> Session:
         """A session of its own that goes on from here, at next to no cost."""
@@ -250,6 +253,7 @@ class Session(Learned):
             "setup": self.setup,
             "offers": getattr(self._env, "n_offers", None),
             "offered": self._n_offered.squeeze(-1).tolist(),
+            "gone": self._n_gone.squeeze(-1).tolist(),
         }
 
     @classmethod
@@ -285,8 +289,9 @@ class Session(Learned):
             session._let_in(Turn(session._index_of(queries), said))
         if content["asked"] is not None:
             session._asked = session._index_of(content["asked"])
-        if content["offered"] is not None:
-            session._n_offered = torch.tensor(content["offered"]).view_as(session._n_offered)
+        if content["offered"] is not None and content["gone"] is not None:
+            session._n_offered = torch.tensor(content["offered"]).view_as(session._n_gone)
+            session._n_gone = torch.tensor(content["gone"]).view_as(session._n_gone)
         return session
 
     @property

@@ -120,7 +120,9 @@ def served(study: Study, port: int = 0) -> Iterator[str]:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listening.bind(("127.0.0.1", port))
         host = f"127.0.0.1:{listening.getsockname()[1]}"
-        config = uvicorn.Config(make_app(study, (host,), None), log_level="error", lifespan="off")
+        config = uvicorn.Config(
+            make_app(study, ("127.0.0.1",), None), log_level="error", lifespan="off"
+        )
         server = uvicorn.Server(config)
         thread = threading.Thread(target=server.run, args=([listening],), daemon=True)
         thread.start()

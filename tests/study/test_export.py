@@ -9,12 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from studies import answer_all, careful, study_of
+from study_helpers import answer_all, careful, study_of
 
 from torchrl_pref import QueryPool, Reward
 from torchrl_pref.errors import InputError
 from torchrl_pref.evaluation.records import read_records
 from torchrl_pref.study.export import export_study
+from torchrl_pref.study.participant import Participant
+from torchrl_pref.study.report import facts
+from torchrl_pref.study.shown import REPEAT
 from torchrl_pref.study.study import Study
 
 OMEGA = torch.tensor([0.8, -0.6, 0.0, 0.0])
@@ -98,6 +101,55 @@ def test_one_person_leaves_one_reward(tmp_path: Path) -> None:
     study.join("nobody")  # who came, and did not answer
     export_study(study)
     assert [path.name for path in (tmp_path / "export").glob("reward*")] == ["reward.json"]
+    study.close()
+
+
+def test_no_reward_of_an_earlier_export_is_left(tmp_path: Path) -> None:
+    """Of one person first, of two then, and of one again."""
+    study = answered(study_of(tmp_path))
+    for code, names in (
+        ("P1", ["reward.json"]),
+        ("P2", ["reward-P1.json", "reward-P2.json"]),
+    ):
+        answered(study, code)
+        export_study(study)
+        assert sorted(one.name for one in (tmp_path / "export").glob("reward*")) == names
+    for one in list(study.people["P2"].said):
+        study.people["P2"].undo(one.shown.key)
+    export_study(study)
+    assert [one.name for one in (tmp_path / "export").glob("reward*")] == ["reward.json"]
+    study.close()
+
+
+def test_a_pool_from_a_file_is_not_said_to_be_of_a_task(tmp_path: Path) -> None:
+    QueryPool(torch.rand(20, 2, 3)).save(tmp_path / "pool.pt")
+    study = study_of(tmp_path, f"pool.file={tmp_path / 'pool.pt'}")
+    person = study.join("P1")
+    assert person is not None
+    answer_all(person, lambda person: 0)
+    export_study(study)
+    folder = tmp_path / "export"
+    assert Reward.load(folder / "reward.json").origin["task"] == "own"
+    assert read_records(folder / "records.csv.gz").tasks == ["own"]
+    assert "gridworld" not in (folder / "report.html").read_text(encoding="utf-8")
+    study.close()
+
+
+@pytest.mark.parametrize(("again", "told"), [(0, "1 of 1"), (1, "0 of 1")])
+def test_the_report_tells_whether_the_same_was_said_again(
+    tmp_path: Path, again: int, told: str
+) -> None:
+    study = study_of(tmp_path, "study.repeats=1")
+    person = study.join("P1")
+    assert person is not None
+
+    def choose(person: Participant) -> int:
+        """The first option of each query, and of the repetition the one that is asked for."""
+        assert person.shown is not None
+        return person.shown.order.index(again if person.shown.purpose == REPEAT else 0)
+
+    answer_all(person, choose)
+    assert facts(study, person)["the same again"] == f"{told} repeated questions"
     study.close()
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from studies import answer_all, careful, client_of, materials_of, study_of
+from study_helpers import answer_all, careful, client_of, materials_of, study_of
 from torch import Generator
 
 from torchrl_pref.envs.query import QueryEnv

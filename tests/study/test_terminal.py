@@ -20,7 +20,7 @@ import pytest
 import torch
 from PIL import Image
 from scripts import TIMEOUT
-from studies import CONF, SMALL, answer_all, careful, materials_of, study_of
+from study_helpers import CONF, SMALL, answer_all, careful, materials_of, study_of
 
 from torchrl_pref.errors import InputError
 from torchrl_pref.study.log import Log, LogError
@@ -210,6 +210,9 @@ def test_any_answer_is_taken_back(
     assert person.shown.again
     kinds = [event.kind for event in study.log.events()]
     assert kinds.count("undo") == 3
+    answered = [event.content["key"] for event in study.log.events() if event.kind == "answer"]
+    undone = [event.content["key"] for event in study.log.events() if event.kind == "undo"]
+    assert undone == [answered[1], answered[3], answered[0]]
     assert kinds.count("answer") == 5
     assert "There is no answer yet." in out
     assert out.count("No answer was taken back: expected a number from 1 to 3.") == 3
@@ -393,7 +396,7 @@ def test_what_cannot_be_saved_is_asked_again(
     full += ["joined", "shown"]
     types(then=lines())
     converse(study, "P1")
-    assert capsys.readouterr().out.count("This could not be saved (disk full).") == 6
+    assert capsys.readouterr().out.count("This could not be saved (disk full).") == 5
     assert [one.said for one in study.people["P1"].said] == [1]
     kinds = [kind for _, kind, _ in events_of(study)]
     assert kinds == [
@@ -498,7 +501,7 @@ def test_what_has_been_learned_is_told(
     assert "Your care is put at" in out
     assert f"Answer {slips[0]} fits badly with the others" in out
     assert f"u {slips[0]} takes it back" in out.replace("\n", " ")
-    assert "The best of the pool is now thought to be trajectory" in out
+    assert "The best of the pool is now thought to be option" in out
     assert re.search(rf"{slips[0]}  [AB]   1.5 s   fits badly with the others", out)
     study.close()
 
@@ -577,6 +580,9 @@ def test_files_are_of_the_open_question_alone(tmp_path: Path) -> None:
     for _ in range(3):
         paths = files.show([scene("#ff0000", 3), scene("#00ff00", 1)])
     assert [path.name for path in paths] == ["A.gif", "B.png"]
+    assert files._work is not None
+    files._work.result()
+    assert [path.exists() for path in paths] == [True, True]
     files.show([scene("#0000ff", 1)])
     files.close()
     assert [path.name for path in (tmp_path / "question").iterdir()] == ["A.png"]
@@ -657,12 +663,12 @@ def test_a_ranking_is_known_before_its_last_letter() -> None:
 
 
 @pytest.fixture
-def run_in_terminal() -> Iterator[Callable[..., Any]]:
+def run_in_terminal(tmp_path: Path) -> Iterator[Callable[..., Any]]:
     """What runs ask.py in a terminal of its own, and talks to it."""
     talks = []
 
     def run(*arguments: str) -> Talk:
-        talks.append(Talk(*arguments))
+        talks.append(Talk(tmp_path, *arguments))
         return talks[-1]
 
     yield run
@@ -673,26 +679,39 @@ def run_in_terminal() -> Iterator[Callable[..., Any]]:
 class Talk:
     """``python ask.py ui=terminal`` in a terminal of its own."""
 
-    def __init__(self, *arguments: str) -> None:
+    def __init__(self, folder: Path, *arguments: str) -> None:
         self._own, its = pty.openpty()
         command = [sys.executable, str(CONF.parent / "ask.py"), "ui=terminal", *arguments]
         environment = {**os.environ, "TERM": "xterm", "COLUMNS": "100", "LINES": "50"}
         self.process = subprocess.Popen(
-            command, stdin=its, stdout=its, stderr=its, env=environment, start_new_session=True
+            command,
+            stdin=its,
+            stdout=its,
+            stderr=its,
+            cwd=folder,
+            env=environment,
+            start_new_session=True,
         )
         os.close(its)
+        self._left = b""  # printed, and not looked at yet
 
     def until(self, text: str) -> str:
         """What is printed until a text is."""
-        printed = b""
-        while text.encode() not in printed:
-            assert select([self._own], [], [], TIMEOUT)[0], printed.decode(errors="replace")
-            printed += os.read(self._own, 65536)  # fails where the program has ended
-        return printed.decode(errors="replace")
+        while text.encode() not in self._left:
+            assert select([self._own], [], [], TIMEOUT)[0], self._left.decode(errors="replace")
+            self._left += os.read(self._own, 65536)  # fails where the program has ended
+        before, found, self._left = self._left.partition(text.encode())
+        return (before + found).decode(errors="replace")
 
     def type(self, text: str) -> None:
         """Type something."""
         os.write(self._own, text.encode())
+
+    def signal(self, number: int) -> None:
+        """Send a signal, and type Enter: one that comes just before the program waits for a line is
+        noticed after the line."""
+        self.process.send_signal(number)
+        self.type("\n")
 
     def end(self) -> None:
         """Kill it, where it has not ended."""
@@ -711,9 +730,9 @@ def test_the_script_in_a_terminal(tmp_path: Path, run_in_terminal: Callable[...,
     talk.until("> ")
     talk.type("r\n")
     assert talk.until("A┌").count("\n") > 10  # upward, and over it
-    talk.process.send_signal(signal.SIGINT)  # in the middle of it
+    talk.signal(signal.SIGINT)  # in the middle of it
     last = talk.until("export: ")
-    assert "1 answers of 1 people" in last
+    assert "1 answer of 1 person" in last
     assert "Traceback" not in last
     assert talk.process.wait() == 0
     again = run_in_terminal(f"resume={folder}")
@@ -721,8 +740,8 @@ def test_the_script_in_a_terminal(tmp_path: Path, run_in_terminal: Callable[...,
     again.type("b\n")
     again.until("Question 3")
     again.until("> ")
-    again.process.send_signal(signal.SIGTERM)
-    assert "2 answers of 1 people" in again.until("stopped")
+    again.signal(signal.SIGTERM)
+    assert "2 answers of 1 person" in again.until("stopped")
     assert again.process.wait() == 128 + signal.SIGTERM
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from starlette.testclient import TestClient
-from studies import client_of, study_of
+from study_helpers import client_of, study_of
 
 from torchrl_pref.study.log import LogError
 from torchrl_pref.study.study import Study
@@ -207,7 +207,9 @@ def test_a_hundred_hostile_requests_change_nothing(study: Study, client: TestCli
         (b'{"code": "P1"}', {**JSON, "origin": "http://127.0.0.1:9999"}, 403),
         (b'{"code": "P1"}', {**JSON, "sec-fetch-site": "cross-site"}, 403),
         (b'{"code": "P1"}', {**JSON, "host": "evil.example"}, 421),
-        (b'{"code": "P1"}', {**JSON, "host": "127.0.0.1:1"}, 421),
+        (b'{"code": "P1"}', {**JSON, "host": "127.0.0.1.evil.example:8000"}, 421),
+        (b'{"code": "P1"}', {**JSON, "host": "evil.example:8000"}, 421),
+        (b'{"code": "P1"}', {**JSON, "host": "[::2]:8000"}, 421),
     ],
 )
 def test_what_no_page_of_ours_sends_is_refused(
@@ -235,7 +237,7 @@ def test_the_page_of_the_study_itself_may_post(client: TestClient) -> None:
         "/static/missing.js",
         "/api/picture/0",
         "/api/picture/-1",
-        "/api/picture/99999999999999999999",
+        f"/api/picture/{'9' * 5000}",
         "/api/picture/../../../etc/passwd",
         "/api/state?code=P9",
         "/api/state?code=%3Cscript%3E",

@@ -71,7 +71,7 @@ def _score_sessions(
     hard = math.isinf(tau)
     unit = 1.0 if hard else tau  # leads are in units of 1/tau
     centred = np.zeros(((n_features + 3) // 4 * 4, n_samples), np.float32)
-    turned, lengths = np.zeros_like(centred), np.ones(n_samples)
+    turned, unit_samples = np.zeros_like(centred), np.empty((n_samples, n_features))
     mean = np.zeros(n_features)
     leads = np.zeros((n_options, len(centred)), np.float32)
     returns = np.zeros((n_options, n_samples), np.float32)
@@ -80,11 +80,10 @@ def _score_sessions(
     sums, left = np.empty(n_options), np.empty(len(centred))
     for s in range(first, last):
         pointed = centred
-        if _measure(samples[s], lengths):
+        if _turn(samples[s], unit_samples):
             pointed = turned
-            _centre(samples[s], lengths, mean, pointed)
-            lengths[:] = 1.0
-        _centre(samples[s], lengths, mean, centred)
+            _centre(unit_samples, mean, pointed)
+        _centre(samples[s], mean, centred)
         shown = queries[min(s, len(queries) - 1)]
         for c in range(len(shown)):
             alike = True
@@ -110,29 +109,40 @@ def _score_sessions(
 
 
 @compiled
-def _measure(samples: Array, lengths: Array) -> bool:
-    """Fill ``lengths`` (M) with those of samples (M D); whether one is not 1 but for rounding."""
+def _turn(samples: Array, unit_samples: Array) -> bool:
+    """Whether the length of a sample (M D) is not 1 but for rounding; if so ``unit_samples`` (M D)
+    is filled with their directions."""
     differ = False
     for m in range(len(samples)):
-        square = 0.0
-        for d in range(samples.shape[1]):
-            square += float(samples[m, d]) ** 2
-        lengths[m] = math.sqrt(square)
-        differ = differ or abs(lengths[m] - 1.0) > ROUNDING
-        lengths[m] = lengths[m] if abs(lengths[m] - 1.0) > ROUNDING else 1.0
+        differ = differ or abs(_length(samples[m]) - 1.0) > ROUNDING
+    if differ:  # as of beliefs that infer tau alone: for others nothing is divided
+        for m in range(len(samples)):
+            length = _length(samples[m])
+            length = length if abs(length - 1.0) > ROUNDING else 1.0
+            for d in range(samples.shape[1]):
+                unit_samples[m, d] = samples[m, d] / length
     return differ
 
 
 @compiled
-def _centre(samples: Array, lengths: Array, mean: Array, centred: Array) -> None:
-    """Fill ``centred`` (P M) with samples (M D) over lengths (M) less their ``mean`` (D)."""
+def _length(sample: Array) -> float:
+    """Of a vector (D)."""
+    square = 0.0
+    for d in range(len(sample)):
+        square += float(sample[d]) ** 2
+    return math.sqrt(square)
+
+
+@compiled
+def _centre(samples: Array, mean: Array, centred: Array) -> None:
+    """Fill ``centred`` (P M) with samples (M D) less their ``mean`` (D)."""
     for d in range(samples.shape[1]):
         mean[d] = 0.0
         for m in range(len(samples)):
-            mean[d] += samples[m, d] / lengths[m]
+            mean[d] += samples[m, d]
         mean[d] /= len(samples)
         for m in range(len(samples)):
-            centred[d, m] = samples[m, d] / lengths[m] - mean[d]
+            centred[d, m] = samples[m, d] - mean[d]
 
 
 @compiled

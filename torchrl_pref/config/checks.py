@@ -95,7 +95,7 @@ def check_path(name: str, value: Any) -> None:
     except (OSError, ValueError):  # too long, or with characters that no path can have
         found = False
     if not found:
-        raise InputError(f"{name}={value}: no such file; check the path")
+        raise InputError(f"{name}={value}: no such file or folder; check the path")
 
 
 def check_loggers(name: str, value: Any) -> None:

@@ -146,6 +146,13 @@ def check_ask_settings(settings: Plain) -> Plain:
     if setup["name"] == "feed":
         if setup["offers"] is not None:
             check_count("setup.offers", setup["offers"], setup["budget"])
+        offers = setup["offers"] or 5 * setup["budget"]
+        if pool["file"] is None and pool["size"] < offers:
+            raise InputError(
+                f"pool.size={pool['size']} with {offers} offers: expected at least as many "
+                "questions as stream by, as nobody is asked one twice; raise it, or lower "
+                "setup.offers"
+            )
         if asks == "lookahead":
             raise InputError(
                 "strategy=lookahead with setup=feed: it looks ahead in a pool of questions; type "
@@ -157,6 +164,13 @@ def check_ask_settings(settings: Plain) -> Plain:
             "many questions as are asked; raise one or lower the other"
         )
     _check_expected(settings)
+    for key in ("attention", "repeats"):
+        number, budget = settings["study"][key], setup["budget"]
+        if number > max(0, budget - 3):
+            raise InputError(
+                f"study.{key}={number} with setup.budget={budget}: expected at most 3 fewer than "
+                "questions, to be spread among them; lower it"
+            )
     check_belief(settings)
     if pool["file"] is None:
         check_options(settings)

@@ -154,7 +154,8 @@ def _csv(path: str, limit: int, choice: Choice) -> Columns:
                 except ValueError:
                     raise Refused(
                         f"line {lines.line_num} has {cells[place]!r:.40} in column {name!r:.80}; "
-                        "expected a number; mend it, or name those of numbers by task.columns=[…]"
+                        "expected a number; mend it, or name those of numbers by task.columns=[…], "
+                        "one of images by task.images="
                     ) from None
             if named_in is not None:
                 named.append(cells[named_in].strip())

@@ -50,7 +50,7 @@ def export_study(study: Study) -> list[Path]:
     folder = study.folder / FOLDER
     try:
         folder.mkdir(exist_ok=True)
-        files = [*_write_answers(folder, list(answer_rows(study)))]
+        files = [*_write_answers(folder, answer_rows(study))]
         files += [folder / name for name in write_records(folder, records_of(study, people))]
         files += [_write_samples(folder / "samples.npz", people)]
         files += _write_rewards(folder, study, people)
@@ -62,29 +62,25 @@ def export_study(study: Study) -> list[Path]:
     return [*files, folder / "report.html"]
 
 
-def answer_rows(study: Study) -> Iterator[Row]:
+def answer_rows(study: Study) -> list[Row]:
     """Every answer that was ever given, in order, also those that were taken back."""
-    by_person: dict[str, list[Event]] = {}
-    for event in study.log.events():
-        by_person.setdefault(event.participant, []).append(event)
-    for code, events in by_person.items():
-        shown: dict[str, dict[str, Any]] = {}
-        undone = {event.content["key"] for event in events if event.kind == "undo"}
-        for event in events:
-            if event.kind == "shown":
-                shown[event.content["key"]] = event.content
-            elif event.kind == "answer":
-                question = shown[event.content["key"]]
-                yield _answer_row(study, code, question, event, event.content["key"] in undone)
+    # Others may answer meanwhile: no more than the people of this study know of.
+    events = [one for one in study.log.events() if one.number <= study.log.last]
+    asked = [one for one in events if "key" in one.content]
+    by_kind: dict[str, dict[tuple[str, str], Event]] = {"shown": {}, "answer": {}, "undo": {}}
+    for event in asked:
+        by_kind[event.kind][event.participant, event.content["key"]] = event
+    return [
+        _answer_row(study, by_kind["shown"][who].content, event, who in by_kind["undo"])
+        for who, event in by_kind["answer"].items()
+    ]
 
 
-def _answer_row(
-    study: Study, code: str, question: dict[str, Any], event: Event, undone: bool
-) -> Row:
+def _answer_row(study: Study, question: dict[str, Any], event: Event, undone: bool) -> Row:
     materials, said = study.materials, event.content["said"]
     wanted, raw = question["wanted"], materials.raw.features[question["query"]]
     row: Row = {
-        "participant": code,
+        "participant": event.participant,
         "event": event.number,
         "at": event.at,
         "key": question["key"],
@@ -131,7 +127,7 @@ def records_of(study: Study, people: Iterable[Participant]) -> Records:
         [
             Entry(
                 protocol="study",
-                task=settings["task"]["name"],
+                task=study.materials.task_name,
                 pool=study.materials.pool.digest,
                 seed=person.seed,
                 strategy=settings["strategy"],
@@ -159,9 +155,14 @@ def _write_samples(path: Path, people: Iterable[Participant]) -> Path:
 
 
 def _write_rewards(folder: Path, study: Study, people: list[Participant]) -> Iterator[Path]:
-    """A reward for each person; of one alone it is ``reward.json``."""
+    """A reward for each person; of one alone it is ``reward.json``. That of an earlier export, when
+    more or fewer people had answered, is removed: it would be taken for one of now."""
+    written = set()
     for person in people:
         name = "reward.json" if len(people) == 1 else f"reward-{person.code}.json"
-        origin = {"participant": person.code, "task": study.materials.settings["task"]["name"]}
+        origin = {"participant": person.code, "task": study.materials.task_name}
         Reward.of(person.session, origin=origin).save(folder / name)
+        written.add(name)
         yield folder / name
+    for name in {"reward.json", *(f"reward-{code}.json" for code in study.people)} - written:
+        (folder / name).unlink(missing_ok=True)

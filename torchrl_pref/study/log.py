@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import sqlite3
 from datetime import UTC, datetime
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,7 +28,8 @@ CREATE TABLE event (
     participant TEXT NOT NULL,
     kind TEXT NOT NULL,
     once TEXT UNIQUE,
-    content TEXT NOT NULL
+    content TEXT NOT NULL,
+    digest TEXT NOT NULL
 ) STRICT;
 CREATE TRIGGER never_changed BEFORE UPDATE ON event
     BEGIN SELECT RAISE(ABORT, 'events are never changed'); END;
@@ -55,18 +57,26 @@ class Event(NamedTuple):
     content: dict[str, Any]
 
 
+def digest_of(*row: str | None) -> str:
+    """By which it is noticed that an event is not as it was written: its SHA-256, shortened."""
+    return sha256(json.dumps(row).encode()).hexdigest()[:16]
+
+
 class Log:
     """The events of a study.
 
     Args:
         path: the file; it is made where it is not there.
 
+    Attributes:
+        last: the number of the newest event that was written here, or known when it was opened.
+
     Raises:
         InputError: it is no log of a study, it is spoiled, or it cannot be opened.
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        self.path, self.last = path, 0
         try:
             # Used by one thread at a time: whoever holds the study's lock.
             self._base = sqlite3.connect(path, isolation_level=None, check_same_thread=False)
@@ -100,6 +110,7 @@ class Log:
         damage = ask("PRAGMA quick_check(1)").fetchone()[0]
         if damage != "ok":
             raise InputError(f"{self.path}: is spoiled ({damage}); restore a copy of it")
+        self.last = ask("SELECT coalesce(max(number), 0) FROM event").fetchone()[0]
 
     def append(
         self, participant: str, kind: str, content: dict[str, Any], once: str | None = None
@@ -119,19 +130,24 @@ class Log:
             LogError: it cannot be written, as on a full disk.
         """
         at = datetime.now(UTC).isoformat()
-        row = at, participant, kind, once, json.dumps(content)
+        event = at, participant, kind, once, json.dumps(content)
+        row = (*event, digest_of(*event))
         try:
             done = self._base.execute(
-                "INSERT INTO event (at, participant, kind, once, content) VALUES (?, ?, ?, ?, ?) "
+                "INSERT INTO event (at, participant, kind, once, content, digest) "
+                "VALUES (?, ?, ?, ?, ?, ?) "
                 "ON CONFLICT (once) DO NOTHING",
                 row,
             )
         except sqlite3.Error as error:
             raise LogError(
-                f"This could not be saved ({error}). Nothing is lost: try again once the disk has "
-                "room."
+                f"The study cannot be written to now ({error}). Nothing that was saved is lost: "
+                "try again once the disk has room."
             ) from None
-        return at if done.rowcount == 1 else None
+        if done.rowcount != 1:
+            return None
+        self.last = done.lastrowid or self.last
+        return at
 
     def events(self, participant: str | None = None) -> list[Event]:
         """What happened, in order; of one participant where one is named.
@@ -139,14 +155,17 @@ class Log:
         Raises:
             InputError: the file is spoiled.
         """
-        query = "SELECT number, at, participant, kind, content FROM event"
+        query = "SELECT number, at, participant, kind, once, content, digest FROM event"
         names = () if participant is None else (participant,)
         where = "" if participant is None else " WHERE participant = ?"
         try:
             found = self._base.execute(f"{query}{where} ORDER BY number", names).fetchall()
+            for place, (number, *row, digest) in enumerate(found, 1):
+                if digest != digest_of(*row) or (participant is None and number != place):
+                    raise ValueError(f"event {number} is not as it was written")
             return [
                 Event(number, at, who, kind, json.loads(content))
-                for number, at, who, kind, content in found
+                for number, at, who, kind, _, content, _ in found
             ]
         except (sqlite3.Error, ValueError) as error:
             raise InputError(f"{self.path}: is spoiled ({error}); restore a copy of it") from None

@@ -53,6 +53,11 @@ class Materials:
         budget: int = self.settings["setup"]["budget"]
         return budget + checks["attention"] + checks["repeats"]
 
+    @property
+    def task_name(self) -> str:
+        """What the questions are about; ``own`` where the pool is a file of the user."""
+        return "own" if self.task is None else str(self.settings["task"]["name"])
+
     def session(self, seed: int, people: int | None = None) -> Session:
         """A session of one person, from the start; or of so many side by side."""
         setup = self.settings["setup"]

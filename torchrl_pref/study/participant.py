@@ -19,7 +19,7 @@ from torchrl_pref.asking import NothingToAsk
 from torchrl_pref.errors import InputError
 from torchrl_pref.questions.base import reordered
 from torchrl_pref.session import Session
-from torchrl_pref.study.log import Event, Log
+from torchrl_pref.study.log import Event, Log, LogError
 from torchrl_pref.study.materials import Materials
 from torchrl_pref.study.shown import ATTENTION, QUESTION, REPEAT, Said, Shown
 
@@ -123,7 +123,8 @@ class Participant:
             "replays": replays,
         }
         self._happened("answer", content, f"answer {key}")
-        self.go_to_next()
+        with suppress(LogError):  # the answer is there; what is next is shown once it can be
+            self.go_to_next()
         return True
 
     def undo(self, key: str) -> bool:
@@ -141,7 +142,8 @@ class Participant:
         if all(one.shown.key != key for one in self.said):
             return False
         self._happened("undo", {"key": key}, f"undo {key}")
-        self.go_to_next()
+        with suppress(LogError):
+            self.go_to_next()
         return True
 
     def stop(self) -> None:
@@ -203,7 +205,7 @@ class Participant:
             case "undo":
                 self._take_back(content["key"])
             case "stop":
-                self._waiting = [self.shown] if self.shown else []
+                self._waiting = [self.shown, *self._waiting] if self.shown else self._waiting
                 self.shown, self.ended = None, "stopped"
             case "go_on":
                 self.ended = None
@@ -217,7 +219,7 @@ class Participant:
         shown = Shown(order=tuple(content["order"]), **{name: content[name] for name in names})
         if shown.purpose == QUESTION:
             self.session.put(shown.query, content["offered"] or None)
-        self.shown, self.ended, self._waiting = shown, None, []
+        self.shown, self.ended, self._waiting = shown, None, self._waiting[1:]
         self.n_shown += 1
 
     def _hear(self, content: dict[str, Any], at: str) -> None:
@@ -241,7 +243,10 @@ class Participant:
             self.session.undo(self.questions.index(one))
         self.said.remove(one)
         self.foreseen = {}
-        self.shown, self.ended, self._waiting = None, None, [replace(one.shown, again=True)]
+        if self.shown is not None and (self.shown.again or self.shown.purpose != QUESTION):
+            self._waiting = [self.shown, *self._waiting]  # it would not come by itself
+        self.shown, self.ended = None, None
+        self._waiting = [replace(one.shown, again=True), *self._waiting]
 
     @property
     def questions(self) -> list[Said]:
@@ -281,7 +286,7 @@ class Participant:
         """A question whose answer is asked for in words, where it is time for one."""
         if not self._is_due(ATTENTION):
             return None
-        query = luck.randrange(len(self._materials.pool))
+        query = luck.choice(self.questions).shown.query  # nothing that a feed did not let through
         wanted = luck.randrange(len(self.session.answers))
         return Shown(key, ATTENTION, query, self._drawn_order(luck), wanted=wanted)
 

@@ -18,7 +18,7 @@ from matplotlib.ticker import MaxNLocator
 from torchrl_pref.errors import InputError
 from torchrl_pref.study.participant import Participant
 from torchrl_pref.study.shown import ATTENTION, REPEAT
-from torchrl_pref.study.state import best_of_pool, doubtful_answers, label_of
+from torchrl_pref.study.state import best_of_pool, doubtful_answers, label_of, name_of_option
 from torchrl_pref.study.study import Study
 from torchrl_pref.tasks.drawing import picture_of
 
@@ -35,7 +35,7 @@ img { max-width: 100%; }
 table { border-collapse: collapse; }
 th, td { padding: .2rem .8rem .2rem 0; text-align: left; font-variant-numeric: tabular-nums; }
 th { font-weight: 500; color: #545f6d; }
-.side { display: flex; gap: 2rem; align-items: flex-start; flex-wrap: wrap; }
+.side { display: grid; grid-template-columns: 1fr 18rem; gap: 2rem; align-items: start; }
 figure { margin: 0; max-width: 18rem; }
 figure img { max-height: 20rem; }
 """
@@ -69,8 +69,9 @@ def _about(study: Study, people: Sequence[Participant]) -> str:
     return (
         f"{len(people)} {'person' if len(people) == 1 else 'people'} gave {answers} answers to "
         f"questions of the kind “{settings['question']['name']}” about the task "
-        f"“{settings['task']['name']}”. Weights are of normalised features, and their squares sum "
-        "to 1; intervals hold 90% of what is still thought possible."
+        f"“{study.materials.task_name}”. Checks are counted among the answers, and teach nothing. "
+        "Weights are of normalised features; whatever they are, the squares of all sum to 1. Shown "
+        "are their means, and intervals that hold 90% of what is still thought possible."
     )
 
 
@@ -92,7 +93,7 @@ def _of_person(study: Study, person: Participant) -> list[str]:
 
 def _best(study: Study, query: int, option: int) -> str:
     """The trajectory that is thought best."""
-    caption = f"Thought to be the best of the pool: option {option + 1} of query {query}."
+    caption = f"Thought to be the best: {name_of_option(query, option)}."
     try:
         picture = _image(picture_of(study.materials.scene(query, option)), caption)
     except InputError as error:  # an image file that is gone
@@ -114,9 +115,9 @@ def facts(study: Study, person: Participant) -> dict[str, str]:
         f"{each:.2f})"
         for key, each in doubtful_answers(person).items()
     ]
+    minutes = sum(one.seconds for one in person.said) / 60
     found = {
-        "answers": f"{len(person.said)}, in {sum(one.seconds for one in person.said) / 60:.1f} "
-        "minutes",
+        "answers": f"{len(person.said)} of {study.materials.n_questions}, in {minutes:.1f} minutes",
         "could not say": str(sum(one.said is None for one in person.said)),
         "how well they are known": f"{100 * float(person.session.expected_alignment[-1]):.0f} of "
         "100 (the alignment that the belief expects)",
@@ -168,7 +169,7 @@ def _draw_weights(axes: Axes, person: Participant, colour: str, offset: float) -
     rows = [row + offset for row in range(len(mean))]
     axes.axvline(0, color=GREY, linewidth=0.8)
     axes.hlines(rows, low, high, color=colour, linewidth=2.5, alpha=0.55)
-    axes.plot(mean, rows, "o", color=colour, markersize=5, label=person.code)
+    axes.plot(mean, rows, "o", color=colour, markersize=5, label=f" {person.code}")
     axes.set(xlim=(-1.05, 1.05), ylim=(len(mean) - 0.5, -0.5))
     axes.set_yticks(range(len(mean)), weights.names, parse_math=False)
 

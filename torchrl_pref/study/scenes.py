@@ -5,6 +5,7 @@ Letters: K options of a question.
 
 from __future__ import annotations
 
+from hashlib import sha256
 from typing import Any
 
 from torchrl_pref.tasks.scene import Picture, Scene, Shape
@@ -14,22 +15,24 @@ DIGITS = 5
 
 
 class Pictures:
-    """The image files that the scenes of a study show, by number: nobody can ask for another."""
+    """The image files that the scenes of a study show: nobody can ask for another.
+
+    A file has the same name for as long as a study lasts, however often it is begun again, as pages
+    that are still open know it.
+    """
 
     def __init__(self) -> None:
-        self._paths: list[str] = []
-        self._numbers: dict[str, int] = {}
+        self._paths: dict[str, str] = {}
 
-    def number(self, path: str) -> int:
-        """The number of an image file."""
-        if path not in self._numbers:
-            self._numbers[path] = len(self._paths)
-            self._paths.append(path)
-        return self._numbers[path]
+    def name(self, path: str) -> str:
+        """What an image file is asked for by."""
+        name = sha256(path.encode()).hexdigest()[:16]
+        self._paths[name] = path
+        return name
 
-    def path(self, number: int) -> str | None:
-        """The file of a number; None where there is none."""
-        return self._paths[number] if 0 <= number < len(self._paths) else None
+    def path(self, name: str) -> str | None:
+        """The file of a name; None where there is none."""
+        return self._paths.get(name)
 
 
 def scene_as_json(scene: Scene, pictures: Pictures) -> dict[str, Any]:
@@ -46,7 +49,7 @@ def scene_as_json(scene: Scene, pictures: Pictures) -> dict[str, Any]:
 def _shape(shape: Shape, pictures: Pictures) -> dict[str, Any]:
     kind = type(shape).__name__.lower()
     if isinstance(shape, Picture):
-        return {"kind": kind, "url": f"/api/picture/{pictures.number(shape.path)}"}
+        return {"kind": kind, "url": f"/api/picture/{pictures.name(shape.path)}"}
     return {"kind": kind, **{key: _rounded(value) for key, value in vars(shape).items()}}
 
 

@@ -85,6 +85,11 @@ def best_of_pool(person: Participant, materials: Materials) -> tuple[int, int]:
     return best // materials.pool.n_options, best % materials.pool.n_options
 
 
+def name_of_option(query: int, option: int) -> str:
+    """What an option of the pool is called; numbers are those of the exported answers."""
+    return f"option {ascii_uppercase[option]} of query {query} of the pool"
+
+
 def _question(person: Participant, materials: Materials, pictures: Pictures) -> dict[str, Any]:
     """The open question, its options in the order in which they are shown."""
     shown = person.shown
@@ -129,7 +134,7 @@ def _learned(
         "worth_asking": gain is None or gain >= materials.settings["study"]["worth"],
         "history": history,
         "best": scene_as_json(materials.scene(query, option), pictures),
-        "best_label": f"trajectory {ascii_uppercase[option]} of question {query + 1} in the pool",
+        "best_label": name_of_option(query, option),
         "rationality": _rationality(person, materials),
         "doubtful": [_doubt(number, one, doubtful) for number, one in _numbered(person, doubtful)],
     }

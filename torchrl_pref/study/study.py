@@ -59,7 +59,7 @@ class Study:
         self.instructions = [] if named is None else read_instructions(named)
         self.log = Log(folder / LOG)
         self.people: dict[str, Participant] = {}
-        self._common = {
+        self._common: dict[str, Any] = {
             "study_seed": materials.settings["seed"],
             "pool": materials.pool.digest,
             "versions": versions(),
@@ -72,7 +72,7 @@ class Study:
     def _replay(self, events: list[Event]) -> list[str]:
         """Let in what happened before; what is worth knowing of it."""
         if not events:
-            self.log.append("", "study", self._common)
+            self.log.append("", "study", {**self._common, "settings": self._deciding()})
             return []
         first = events[0].content
         if first.get("pool") != self._common["pool"]:
@@ -80,6 +80,13 @@ class Study:
                 f"{self.log.path}: people were asked about another pool; restore the pool file of "
                 "the study"
             )
+        for key, was in first.get("settings", {}).items():
+            now = self._deciding().get(key)
+            if now != was:
+                raise InputError(
+                    f"{self.log.path}: people were asked with {key}={was!s:.80}, and the settings "
+                    f"of the study now say {now!s:.80}; restore its settings"
+                )
         by_person: dict[str, list[Event]] = {}
         for event in events[1:]:
             by_person.setdefault(event.participant, []).append(event)
@@ -95,6 +102,13 @@ class Study:
         if not other:
             return []
         return [f"note: {', '.join(other)}; a belief may differ in its last digits"]
+
+    def _deciding(self) -> dict[str, Any]:
+        """The settings from which, with the pool and the answers, all follows."""
+        settings = self.materials.settings
+        checks = {f"study.{name}": settings["study"][name] for name in ("attention", "repeats")}
+        named = ("question", "belief", "setup", "strategy", "tau", "seed")
+        return {**{name: settings[name] for name in named}, **checks}
 
     @contextmanager
     def turn(self) -> Iterator[None]:

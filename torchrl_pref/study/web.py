@@ -7,6 +7,7 @@ is said back, and nothing is run or read because a request names it.
 from __future__ import annotations
 
 import json
+import re
 import secrets
 from collections.abc import Callable
 from importlib.resources import files
@@ -65,7 +66,8 @@ def make_app(study: Study, hosts: tuple[str, ...], token: str | None) -> ASGIApp
 
     Args:
         study: what it serves.
-        hosts: what the header Host may be, as ``127.0.0.1:8000``; empty where a token is asked for.
+        hosts: names that the page may be asked for by, in the header Host, whatever the port, as
+            of a tunnel; empty where a token is asked for.
         token: what each request but those for the page's own files must bring; None on loopback.
     """
     routes = [
@@ -73,7 +75,7 @@ def make_app(study: Study, hosts: tuple[str, ...], token: str | None) -> ASGIApp
         *(Route(f"/static/{name}", _file(name)) for name in static_files()),
         Route("/api/study", _endpoint(study, token, _about)),
         Route("/api/state", _endpoint(study, token, _state)),
-        Route("/api/picture/{number:int}", _endpoint(study, token, _picture)),
+        Route("/api/picture/{name}", _endpoint(study, token, _picture)),
         Route("/api/join", _endpoint(study, token, _join), methods=["POST"]),
         Route("/api/answer", _endpoint(study, token, _answer), methods=["POST"]),
         Route("/api/undo", _endpoint(study, token, _undo), methods=["POST"]),
@@ -107,10 +109,13 @@ def guarded(app: ASGIApp, hosts: tuple[str, ...]) -> ASGIApp:
 def refuse_foreign(request: Request, hosts: tuple[str, ...]) -> Response | None:
     """What is said to requests that other pages make, or that come under another name."""
     host, origin = request.headers.get("host", ""), request.headers.get("origin")
-    if hosts and host.lower() not in hosts:  # a foreign name that leads here (DNS rebinding)
+    name = host.lower().rpartition(":")[0] if re.search(r":\d+$", host) else host.lower()
+    if hosts and name not in hosts:  # a foreign name that leads here (DNS rebinding)
         return _sentence(421, "This study is not served under that name.")
     site = request.headers.get("sec-fetch-site", "same-origin")
-    foreign = origin is not None and origin.lower() != f"http://{host.lower()}"
+    # https, where a server with a certificate stands before this one.
+    own = f"http://{host.lower()}", f"https://{host.lower()}"
+    foreign = origin is not None and origin.lower() not in own
     if request.method not in ("GET", "HEAD") and (foreign or site not in ("same-origin", "none")):
         return _sentence(403, "Only the page of this study may do that.")
     return None
@@ -187,7 +192,7 @@ async def _read(request: Request) -> dict[str, Any]:
     """
     kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if kind != "application/json":
-        raise Refused(415, "Expected JSON.")
+        raise Refused(415, "Expected JSON, with Content-Type: application/json.")
     body = b""
     async for part in request.stream():
         body += part
@@ -210,7 +215,7 @@ def _field(said: dict[str, Any], name: str, kinds: tuple[type, ...]) -> Any:
     """
     value = said.get(name)
     if name not in said or type(value) not in kinds:
-        raise Refused(400, f"The request lacks its {name}.")
+        raise Refused(400, f"The request lacks its {name}, or it is of another type.")
     return value
 
 
@@ -276,7 +281,7 @@ def _answer(study: Study, said: dict[str, Any]) -> Participant:
 def _undo(study: Study, said: dict[str, Any]) -> Participant:
     person = _person(study, said)
     if not person.undo(_field(said, "key", (str,))):
-        raise Refused(409, "That answer was taken back already.", person)
+        raise Refused(409, "There is no such answer, or it was taken back already.", person)
     return person
 
 
@@ -293,7 +298,7 @@ def _go_on(study: Study, said: dict[str, Any]) -> Participant:
 
 
 def _picture(study: Study, said: dict[str, Any]) -> Response:
-    path = study.pictures.path(said["number"])
+    path = study.pictures.path(said["name"])
     if path is None:
         raise Refused(404, "There is no such picture.")
     try:

@@ -9,6 +9,7 @@ import { Player } from "./player.js";
 import { get, post } from "./server.js";
 
 const RETRY = 2000; // milliseconds
+const NO_KEY = 401; // the status where the link lacks its key: with the right link it goes on
 const kept = sessionStorage; // of this tab: who answers in another one may be somebody else
 
 let study = null;
@@ -75,8 +76,8 @@ async function resume(code) {
   const sent = kept.getItem("answer");
   if (sent !== null) {
     const pending = JSON.parse(sent);
-    if (pending.code === code) await surely(() => post("/api/answer", pending));
-    kept.removeItem("answer");
+    const { status } = await surely(() => post("/api/answer", pending));
+    if (status !== NO_KEY) kept.removeItem("answer");
   }
   await join(code, false);
 }
@@ -104,6 +105,7 @@ const ABOUT = (count) =>
 
 function welcome() {
   leave();
+  state = null;
   byId("progress").hidden = byId("who").hidden = byId("learned").hidden = true;
   const invited = new URLSearchParams(location.hash.slice(1)).get("code") ?? "";
   const code = element("input", {
@@ -138,6 +140,7 @@ function show(next) {
   state = next;
   leave();
   byId("who").replaceChildren(`You are ${state.code}. `, button("Somebody else", null, () => {
+    if (answering?.busy) return; // an answer is on its way
     kept.clear();
     byId("problem").hidden = true;
     welcome();
@@ -221,7 +224,8 @@ async function change(path, body) {
     answering.close();
   }
   player?.pause();
-  const { status, content } = await surely(() => post(path, { code: state.code, ...body }));
+  const { code } = state;
+  const { status, content } = await surely(() => post(path, { code, ...body }));
   const next = status === 200 ? content : content.state;
   if (next) show(next);
   else if (status === 404) {
@@ -231,6 +235,7 @@ async function change(path, body) {
     show(state);
   }
   if (status !== 200) notice(content.error);
+  return status;
 }
 
 async function answer(number) {
@@ -240,8 +245,7 @@ async function answer(number) {
   };
   if (answering.busy) return;
   kept.setItem("answer", JSON.stringify({ code: state.code, ...said }));
-  await change("/api/answer", said);
-  kept.removeItem("answer");
+  if ((await change("/api/answer", said)) !== NO_KEY) kept.removeItem("answer");
 }
 
 const undo = (key) => change("/api/undo", { key });

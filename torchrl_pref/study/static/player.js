@@ -61,20 +61,20 @@ export class Player {
   }
 
   toggled() {
-    if (this.length < 2) return;
+    if (!(this.length > 1)) return; // one moment, or not loaded yet
     if (this.playing) this.pause();
     else if (this.at >= 1) this.replay();
     else this.play(this.at);
   }
 
   replay() {
-    if (this.length < 2) return;
+    if (!(this.length > 1)) return; // one moment, or not loaded yet
     this.replays += 1;
     this.play(0);
   }
 
   nextSpeed() {
-    if (this.length < 2) return;
+    if (!(this.length > 1)) return; // one moment, or not loaded yet
     speed = (speed + 1) % SPEEDS.length;
     this.told();
   }

@@ -30,8 +30,12 @@ STUDIES = {
     "policy": ("strategy=policy",),
     "policy, feed": ("strategy=policy", "setup=feed"),
     "alignment_gain": ("strategy=alignment_gain",),
-    "policy, ranking of 4": ("strategy=policy", "question=ranking", "pool.options=4"),
 }
+
+FIRST = 2
+"""Answers that are left out: what the browser and the server do once only is in them."""
+
+BUDGET = 40
 
 LUCK = random.Random(0)
 
@@ -64,19 +68,20 @@ def over_http(server: Server, think: float) -> Iterator[float]:
 def in_browser(server: Server, browser: Browser, think: float) -> Iterator[float]:
     """The same at the page, of questions that one key answers."""
     browser.begin(server.link)
-    for _ in range(19):
+    for _ in range(BUDGET - 1):
         time.sleep(think)
         yield browser.driver.execute_async_script(WAIT, LUCK.choice("ab"))
 
 
 def row(label: str, where: str, size: int, took: list[float]) -> Row:
     """What is told of some times in milliseconds."""
+    took = took[FIRST:]
     return {
         "strategy": label,
         "measured": where,
         "N": size,
         "median ms": statistics.median(took),
-        "95% ms": sorted(took)[int(0.95 * len(took))],
+        "95% ms": statistics.quantiles(took, n=20, method="inclusive")[-1],
         "most ms": max(took),
     }
 
@@ -93,17 +98,19 @@ def main() -> None:
     browser = Browser()
     for label, options in tqdm(STUDIES.items(), desc="strategies"):
         with tempfile.TemporaryDirectory() as scratch:
-            common = "task=driver", f"pool.size={typed.size}", *options
+            common = f"setup.budget={BUDGET}", "task=driver", f"pool.size={typed.size}", *options
             server = Server(f"hydra.run.dir={scratch}/study", *common)
             rows.append(row(label, "server", typed.size, list(over_http(server, typed.think))))
-            if "ranking" not in label:
-                browser_server = Server(f"hydra.run.dir={scratch}/other", *common)
-                took = list(in_browser(browser_server, browser, typed.think))
-                rows.append(row(label, "Chromium", typed.size, took))
-                browser_server.close()
+            server.close()
+            server = Server(f"hydra.run.dir={scratch}/other", *common)
+            took = list(in_browser(server, browser, typed.think))
+            rows.append(row(label, "Chromium", typed.size, took))
             server.close()
     browser.close()
-    title = f"From an answer to the next question, Driver, answered after {typed.think:g} s"
+    title = (
+        f"From an answer to the next question, Driver, each answered after {typed.think:g} s; of "
+        f"{BUDGET} answers all but the first {FIRST}"
+    )
     report(title, rows, typed.json)
     limits = {"server": 30.0, "Chromium": 100.0}
     raise SystemExit(any(one["95% ms"] > limits[one["measured"]] for one in rows))

@@ -35,7 +35,7 @@ STUDIES = {
 FIRST = 2
 """Answers that are left out: what the browser and the server do once only is in them."""
 
-BUDGET = 40
+BUDGET = 20
 
 LUCK = random.Random(0)
 

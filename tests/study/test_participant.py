@@ -233,7 +233,7 @@ def test_checks_are_spread_and_tell_the_belief_nothing(tmp_path: Path) -> None:
             assert before.shown.order == one.shown.order[::-1]
             assert before.answer == one.answer  # said of the same, in another order
             assert person.said.index(one) - person.said.index(before) > 2
-    note = state_of(person, study.materials, study.pictures)
+    note = state_of(person, study.materials, study.scenes)
     assert note["phase"] == "end"
     study.close()
 
@@ -281,7 +281,7 @@ def test_answers_that_fit_the_others_badly_are_shown(tmp_path: Path) -> None:
     answer_all(person, slip_once)
     assert slips
     assert set(doubtful_answers(person)) == set(slips)
-    state = state_of(person, study.materials, study.pictures)
+    state = state_of(person, study.materials, study.scenes)
     assert [one["key"] for one in state["answers"] if one["doubtful"]] == slips
     assert [one["key"] for one in state["learned"]["doubtful"]] == slips
     assert torch.cosine_similarity(person.session.weights.mean, OMEGA, dim=0) > 0.5

@@ -81,7 +81,7 @@ def _of_person(study: Study, person: Participant) -> list[str]:
         f"<tr><th>{escape(name)}</th><td>{escape(text)}</td></tr>"
         for name, text in facts(study, person).items()
     )
-    query, option = best_of_pool(person, study.materials)
+    query, option = best_of_pool(person.session, study.materials)
     return [
         f"<h2>{escape(person.code)}</h2>",
         _image(person_figure(person), f"Weights, certainty and times of {person.code}"),

@@ -11,16 +11,17 @@ from typing import Any
 import torch
 
 from torchrl_pref.questions.base import answers_on
+from torchrl_pref.session import Session
 from torchrl_pref.study.materials import Materials
 from torchrl_pref.study.participant import Participant
-from torchrl_pref.study.scenes import Pictures, scene_as_json
+from torchrl_pref.study.scenes import Scenes
 from torchrl_pref.study.shown import ATTENTION, QUESTION, Said, Shown
 
 DOUBTFUL = 0.5
 """An answer fits the rest badly if it is less probable than this share of one by chance."""
 
 
-def state_of(person: Participant, materials: Materials, pictures: Pictures) -> dict[str, Any]:
+def state_of(person: Participant, materials: Materials, scenes: Scenes) -> dict[str, Any]:
     """All that a page shows of a participant."""
     doubtful = doubtful_answers(person)
     return {
@@ -28,8 +29,8 @@ def state_of(person: Participant, materials: Materials, pictures: Pictures) -> d
         "code": person.code,
         "answered": len(person.said),
         "budget": materials.n_questions,
-        "question": None if person.shown is None else _question(person, materials, pictures),
-        "learned": _learned(person, materials, pictures, doubtful),
+        "question": None if person.shown is None else _question(person, materials, scenes),
+        "learned": _learned(person, materials, scenes, doubtful),
         "answers": [
             {
                 "number": number + 1,
@@ -78,9 +79,9 @@ def doubtful_answers(person: Participant) -> dict[str, float]:
     return {one.shown.key: each for one, each in told if each < DOUBTFUL * chance}
 
 
-def best_of_pool(person: Participant, materials: Materials) -> tuple[int, int]:
+def best_of_pool(session: Session, materials: Materials) -> tuple[int, int]:
     """The query and the option that the belief now holds to be the best trajectory."""
-    returns = materials.pool.features @ person.session.weights.mean
+    returns = materials.pool.features @ session.weights.mean
     best = int(returns.argmax())
     return best // materials.pool.n_options, best % materials.pool.n_options
 
@@ -90,11 +91,10 @@ def name_of_option(query: int, option: int) -> str:
     return f"option {ascii_uppercase[option]} of query {query} of the pool"
 
 
-def _question(person: Participant, materials: Materials, pictures: Pictures) -> dict[str, Any]:
+def _question(person: Participant, materials: Materials, scenes: Scenes) -> dict[str, Any]:
     """The open question, its options in the order in which they are shown."""
     shown = person.shown
     assert shown is not None
-    scenes = [materials.scene(shown.query, option) for option in shown.order]
     return {
         "key": shown.key,
         "number": len(person.said) + 1,
@@ -102,7 +102,7 @@ def _question(person: Participant, materials: Materials, pictures: Pictures) -> 
         "prompt": materials.question.prompt,
         "note": _note(shown, materials),
         "again": shown.again,
-        "options": [scene_as_json(scene, pictures) for scene in scenes],
+        "options": [scenes.of(shown.query, option) for option in shown.order],
         "answers": possible_answers(materials),
         "cannot_say": True,
     }
@@ -116,14 +116,14 @@ def _note(shown: Shown, materials: Materials) -> str | None:
 
 
 def _learned(
-    person: Participant, materials: Materials, pictures: Pictures, doubtful: dict[str, float]
+    person: Participant, materials: Materials, scenes: Scenes, doubtful: dict[str, float]
 ) -> dict[str, Any]:
     """What has been learned so far, and what the next answer is expected to add."""
     session, weights = person.session, person.session.weights
     history = session.expected_alignment.tolist()
     asks = person.shown is not None and person.shown.purpose == QUESTION
     gain = float(session.expected_gain) if asks else None
-    query, option = best_of_pool(person, materials)
+    query, option = best_of_pool(session, materials)
     return {
         "names": list(weights.names),
         "mean": weights.mean.tolist(),
@@ -133,7 +133,7 @@ def _learned(
         "expected_gain": gain,
         "worth_asking": gain is None or gain >= materials.settings["study"]["worth"],
         "history": history,
-        "best": scene_as_json(materials.scene(query, option), pictures),
+        "best": scenes.of(query, option),
         "best_label": name_of_option(query, option),
         "rationality": _rationality(person, materials),
         "doubtful": [_doubt(number, one, doubtful) for number, one in _numbered(person, doubtful)],

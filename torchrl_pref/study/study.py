@@ -22,8 +22,8 @@ from torchrl_pref.study.instructions import read_instructions
 from torchrl_pref.study.log import Event, Log
 from torchrl_pref.study.materials import Materials
 from torchrl_pref.study.participant import Participant
-from torchrl_pref.study.scenes import Pictures
-from torchrl_pref.study.state import state_of
+from torchrl_pref.study.scenes import Scenes
+from torchrl_pref.study.state import best_of_pool, state_of
 
 LOG = "study.db"
 """The log of a study, in its folder."""
@@ -45,7 +45,7 @@ class Study:
 
     Attributes:
         people: participants by their codes, in the order in which they came.
-        pictures: the image files that its scenes show.
+        scenes: of the pool, as a page draws them.
         notes: what is worth knowing of how it goes on, a sentence each.
 
     Raises:
@@ -53,7 +53,7 @@ class Study:
     """
 
     def __init__(self, folder: Path, materials: Materials) -> None:
-        self.folder, self.materials, self.pictures = folder, materials, Pictures()
+        self.folder, self.materials, self.scenes = folder, materials, Scenes(materials)
         settings = materials.settings["study"]
         named = settings["instructions"]
         self.instructions = [] if named is None else read_instructions(named)
@@ -157,7 +157,7 @@ class Study:
             LogError: the next question could not be written down yet.
         """
         person.go_to_next()
-        state = state_of(person, self.materials, self.pictures)
+        state = state_of(person, self.materials, self.scenes)
         self._to_think.put(person)
         return state
 
@@ -183,6 +183,16 @@ class Study:
                     time.sleep(0.001)
                 with self._lock:
                     more = person.foresee()
+                    self._draw_ahead(person)
+
+    def _draw_ahead(self, person: Participant) -> None:
+        """Make the scenes that may be shown next."""
+        for session in person.foreseen.values():
+            self.scenes.of(*best_of_pool(session, self.materials))
+            with suppress(NothingToAsk):
+                query = int(session.ask().query)
+                for option in range(self.materials.pool.n_options):
+                    self.scenes.of(query, option)
 
     def close(self) -> None:
         """End what is thought ahead, and let the log go."""

@@ -298,7 +298,7 @@ def _go_on(study: Study, said: dict[str, Any]) -> Participant:
 
 
 def _picture(study: Study, said: dict[str, Any]) -> Response:
-    path = study.pictures.path(said["name"])
+    path = study.scenes.path(said["name"])
     if path is None:
         raise Refused(404, "There is no such picture.")
     try:

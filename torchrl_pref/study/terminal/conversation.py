@@ -252,7 +252,7 @@ class Conversation:
             say(sentence)
         with self._study.turn():
             materials = self._study.materials
-            scene = materials.scene(*best_of_pool(self._person, materials))
+            scene = materials.scene(*best_of_pool(self._person.session, materials))
         say(f"The best of the pool is now thought to be {state['learned']['best_label']}:")
         room = room_of(sys.stdout)._replace(lines=0)  # no larger than it has to be
         print("\n".join(options_as_text([scene], room, letters="")))

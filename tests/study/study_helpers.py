@@ -44,7 +44,7 @@ def study_of(folder: Path, *typed: str) -> Study:
 
 def client_of(study: Study, token: str | None = None) -> TestClient:
     """Who talks to the server of a study, as from its page."""
-    app = make_app(study, () if token else ("127.0.0.1",), token)
+    app = make_app(study, () if token else ("127.0.0.1", "localhost"), token)
     return TestClient(app, f"http://{ADDRESS}", raise_server_exceptions=False)
 
 

@@ -331,3 +331,41 @@ const canvas = document.querySelector("main canvas");
 const pixels = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
 return pixels.some((value) => value > 0);
 """
+
+
+def test_somebody_else_begins_and_nothing_of_the_first_is_touched(
+    study: Study, browser: Browser
+) -> None:
+    with served(study) as link:
+        browser.begin(link)
+        browser.answer("a", "Question 2")
+        browser.click("Somebody else")
+        browser.wait_for("#code")
+        browser.press(Keys.TAB)
+        browser.press("u", "a", "r", " ")  # which were keys of the first person
+        browser.begin(link, "P2")
+        browser.answer("b", "Question 2")
+    assert said(study) == [0]
+    assert said(study, "P2") == [1]
+
+
+def test_an_answer_is_kept_until_the_link_has_its_key(tmp_path: Path, browser: Browser) -> None:
+    study = study_of(tmp_path / "study")
+    with served(study) as link:
+        browser.begin(link)
+        threading.Event().wait(0.4)
+        key = study.people["P1"].shown
+        assert key is not None
+        browser.driver.execute_script(WITHOUT_KEY)
+        browser.press("b")
+        browser.until(lambda: "lacks the key" in browser.text("#problem"))
+        browser.driver.refresh()
+        browser.until(lambda: "Question 2" in browser.text("#count"))
+    assert said(study) == [1]
+    study.close()
+
+
+WITHOUT_KEY = """
+window.fetch = async () => new Response(
+  JSON.stringify({ error: "This link lacks the key of the study.", state: null }), { status: 401 });
+"""

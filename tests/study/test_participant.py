@@ -325,3 +325,44 @@ def test_a_log_whose_events_do_not_follow_is_refused(tmp_path: Path) -> None:
     assert person.shown is not None
     with pytest.raises(InputError, match="does not follow from those before it"):
         study_of(tmp_path)
+
+
+@pytest.mark.parametrize("setup", ["query", "feed"])
+def test_several_answers_taken_back_in_a_row_are_all_asked_again(
+    tmp_path: Path, setup: str
+) -> None:
+    study = study_of(tmp_path, f"setup={setup}")
+    person = person_of(study)
+    answer_all(person, careful(OMEGA))
+    taken = [one.shown for one in person.said[1:4]]
+    for shown in taken:
+        person.undo(shown.key)
+    assert same(person, study_of(tmp_path, f"setup={setup}").people["P1"])
+    for shown in reversed(taken):
+        assert person.shown is not None
+        assert (person.shown.query, person.shown.order) == (shown.query, shown.order)
+        assert person.shown.again
+        person.answer(person.shown.key, 0, 1.0, 0)
+    assert person.ended == "budget"
+    assert len(person.said) == 6
+    study.close()
+
+
+def test_nobody_is_asked_twice_in_a_feed(tmp_path: Path) -> None:
+    study = study_of(tmp_path, "setup=feed", "setup.budget=12")
+    for code in ("P1", "P2", "P3", "P4"):
+        person = person_of(study, code)
+        answer_all(person, careful(OMEGA))
+        asked = [one.shown.query for one in person.said]
+        assert len(set(asked)) == len(asked)
+    study.close()
+
+
+@pytest.mark.parametrize("typed", ["seed=7", "tau=2", "question=weak", "belief=sampled"])
+def test_a_study_goes_on_with_its_own_settings_alone(tmp_path: Path, typed: str) -> None:
+    study = study_of(tmp_path)
+    person_of(study)
+    study.close()
+    study_of(tmp_path, "study.title=Another").close()  # which decides nothing
+    with pytest.raises(InputError, match=rf"people were asked with {typed.partition('=')[0]}="):
+        study_of(tmp_path, typed)

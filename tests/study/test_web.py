@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image
 from starlette.testclient import TestClient
 from study_helpers import client_of, study_of
 
 from torchrl_pref.study.log import LogError
+from torchrl_pref.study.serve import Address, listening_at, read_address, write_address
 from torchrl_pref.study.study import Study
 
 JSON = {"content-type": "application/json"}
@@ -316,3 +318,51 @@ def test_thinking_ahead_changes_nothing(tmp_path: Path) -> None:
         states.append(state)
         study.close()
     assert states[0] == states[1]
+
+
+@pytest.mark.parametrize("origin", ["http://localhost:9000", "https://localhost:9000"])
+def test_a_tunnel_or_a_server_with_a_certificate_may_stand_before_it(
+    client: TestClient, origin: str
+) -> None:
+    headers = {**JSON, "host": "localhost:9000", "origin": origin}
+    reply = client.post("/api/join", content=b'{"code": "P1"}', headers=headers)
+    assert reply.status_code == 200
+
+
+def test_pictures_have_the_same_name_after_a_restart(tmp_path: Path) -> None:
+    rows = ["image,size,age"]
+    for number in range(8):
+        Image.new("RGB", (4, 3), (20 * number, 0, 0)).save(tmp_path / f"{number}.png")
+        rows.append(f"{number}.png,{number},{number % 3}")
+    (tmp_path / "t.csv").write_text("\n".join(rows))
+    typed = "task=files", f"task.path={tmp_path / 't.csv'}", "task.images=image", "pool.size=20"
+    (tmp_path / "study").mkdir()
+    found: dict[str, bytes] = {}
+    for code in ("P1", "P2", "P1"):  # in another order than they were first seen
+        study = study_of(tmp_path / "study", *typed)
+        client = client_of(study)
+        state = joined(client, code)
+        for scene in (*state["question"]["options"], state["learned"]["best"]):
+            url = scene["frames"][0][0]["url"]
+            content = client.get(url).content
+            assert content.startswith(b"\x89PNG")
+            assert found.setdefault(url, content) == content
+        study.close()
+
+
+def test_a_study_is_found_at_the_same_link_when_it_goes_on(tmp_path: Path) -> None:
+    assert read_address(tmp_path) == Address()
+    known = Address(43210, "x" * 32)
+    write_address(tmp_path, known)
+    assert read_address(tmp_path) == known
+    assert (tmp_path / "address.json").stat().st_mode & 0o077 == 0
+    with listening_at(tmp_path, "127.0.0.1", 0) as listening:
+        port = listening.getsockname()[1]
+    write_address(tmp_path, Address(port, "x" * 32))
+    with listening_at(tmp_path, "127.0.0.1", 0) as listening:
+        assert listening.getsockname()[1] == port
+        with listening_at(tmp_path, "127.0.0.1", 0) as other:  # it is taken
+            assert other.getsockname()[1] != port
+    for spoiled in ("", "[]", '{"port": 1}', '{"port": 99999, "token": "x"}', '{"port": null}'):
+        (tmp_path / "address.json").write_text(spoiled)
+        assert read_address(tmp_path) == Address()

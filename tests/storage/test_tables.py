@@ -152,15 +152,40 @@ def varint(number: int) -> bytes:
     return bytes([*found, doubled])
 
 
+def with_other_footer(data: bytes, instead: dict[int, int]) -> bytes:
+    """A Parquet file whose footer says other numbers."""
+    (length,) = struct.unpack("<I", data[-8:-4])
+    body, footer = data[: -8 - length], data[-8 - length : -8]
+    for there, claimed in instead.items():
+        assert varint(there) in footer
+        footer = footer.replace(varint(there), varint(claimed))
+    return body + footer + struct.pack("<I", len(footer)) + b"PAR1"
+
+
 def lying_parquet(claimed: int) -> bytes:
     """A small file whose footer claims more rows."""
     rows = 12345  # whose bytes stand for nothing else in the footer
     data = parquet_bytes(pa.table(dict.fromkeys("ab", np.arange(float(rows)))))
-    (length,) = struct.unpack("<I", data[-8:-4])
-    body, footer = data[: -8 - length], data[-8 - length : -8]
-    assert varint(rows) in footer
-    lying = footer.replace(varint(rows), varint(claimed))
-    return body + lying + struct.pack("<I", len(lying)) + b"PAR1"
+    return with_other_footer(data, {rows: claimed})
+
+
+def large_pages() -> bytes:
+    """A small file with a page of 240 MB in each column, of which its footer says nothing."""
+    rows = 3 * 10**7
+    data = parquet_bytes(
+        pa.table(dict.fromkeys("ab", np.zeros(rows))),
+        compression="zstd",
+        use_dictionary=False,
+        store_schema=False,
+        write_statistics=False,
+        row_group_size=rows,
+        write_batch_size=rows,
+        data_page_size=2**30,
+        max_rows_per_page=rows,
+    )
+    group = parquet.ParquetFile(io.BytesIO(data)).metadata.row_group(0)
+    column = group.column(0).total_uncompressed_size
+    return with_other_footer(data, {rows: 100, column: 800, group.total_byte_size: 1600})
 
 
 def with_nan() -> np.ndarray:
@@ -329,6 +354,11 @@ BAD: dict[str, tuple[str, Callable[[], bytes | str], str]] = {
         ".parquet",
         lambda: lying_parquet(10**6),
         "says that it has 1,000,000 rows, and 12,345 are there",
+    ),
+    "parquet: pages larger than claimed": (
+        ".parquet",
+        large_pages,
+        "has pages that unpack to 240 MB",
     ),
     "parquet: text": (".parquet", lambda: csv_text(), "cannot be read"),
     "parquet: NaN": (".parquet", lambda: parquet_bytes(table(more=with_nan()[:, 1])), "holds NaN"),

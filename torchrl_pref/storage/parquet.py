@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import Any
+
 import numpy as np
 
 from torchrl_pref.storage.columns import Choice, Columns, Refused
+from torchrl_pref.storage.pages import check_pages
 
 
 def read_parquet(path: str, limit: int, choice: Choice) -> Columns:
@@ -35,6 +39,7 @@ def read_parquet(path: str, limit: int, choice: Choice) -> Columns:
                 f"says that it unpacks to {claimed / 1e6:.0f} MB; expected at most "
                 f"{limit / 1e6:.0f} MB from a file of its size"
             )
+        check_pages(path, [place for group in groups for place in _places(group)], limit)
         table = file.read(columns=chosen, use_threads=False)
     if table.num_rows != metadata.num_rows:
         raise Refused(
@@ -56,3 +61,12 @@ def read_parquet(path: str, limit: int, choice: Choice) -> Columns:
         else:
             columns[name] = column.to_numpy()
     return columns
+
+
+def _places(group: Any) -> Iterator[tuple[int, int]]:
+    """Of each column of a group of rows where its first page begins, and its bytes in the file."""
+    for number in range(group.num_columns):
+        column = group.column(number)
+        first, names = column.data_page_offset, column.dictionary_page_offset
+        # A place of 0 is none; pyarrow begins at the texts where these stand before the numbers.
+        yield names if names and 0 < names < first else first, column.total_compressed_size

@@ -262,6 +262,29 @@ def test_raw_features_are_normalised_where_the_session_knows_how() -> None:
     assert torch.allclose(found, expected, atol=1e-5)
 
 
+def test_gradients_of_features_end_where_they_are_given() -> None:
+    raw = torch.rand(30, 2, 3, generator=Generator().manual_seed(0), requires_grad=True)
+    normalizer = Normalizer.fit(raw)
+    pool = QueryPool(raw).map_features(normalizer)
+    for given in (None, normalizer):
+        session = Session(pool, MODEL, normalizer=given)
+        session.ask()
+        session.tell(0)
+        found = [*session.score(raw[:, 0]), session.weights.mean, normalizer.mean, normalizer.std]
+        assert not any(one.requires_grad for one in found)
+        assert torch.equal(found[0], session.score(raw[:, 0].detach())[0])
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (2, 4), (1, 2, 3)])
+@pytest.mark.parametrize("normalized", [False, True])
+def test_only_rows_of_features_are_scored(shape: tuple[int, ...], normalized: bool) -> None:
+    features = torch.rand(30, 2, 3, generator=Generator().manual_seed(0))
+    normalizer = Normalizer.fit(features) if normalized else None
+    session = Session(features, MODEL, normalizer=normalizer)
+    with pytest.raises(InputError, match=r"expected \(n, 3\)"):
+        session.score(torch.ones(shape))
+
+
 def test_it_aligns_as_the_environment_does(generator: Generator) -> None:
     """Thirty simulated people at once, as well as thirty in an environment would."""
     features = torch.randn(200, 2, 4, generator=generator)

@@ -113,18 +113,20 @@ class Learned:
             features: (n D), raw where the session knows the normaliser, else normalised.
 
         Returns:
-            (B n) and (B n), mean and standard deviation over the samples.
+            (B n) and (B n), mean and standard deviation over the samples. No gradients flow through
+            them: those of a :class:`reward.Reward` are for that.
 
         Raises:
             InputError: the features are not (n D) finite numbers.
         """
         check_finite("features", check_plain("features", features))
-        if self.normalizer is not None:
-            features = self.normalizer(features)
         if features.ndim != 2 or features.shape[-1] != self.pool.n_features:
             raise InputError(
                 f"features of shape {tuple(features.shape)}: expected (n, {self.pool.n_features})"
             )
+        features = features.detach()
+        if self.normalizer is not None:
+            features = self.normalizer(features)
         mean, deviation = scores(directions(self._states[-1]["samples"]), features.float())
         return self._plain(mean), self._plain(deviation)
 

@@ -188,7 +188,7 @@ class Normalizer:
                 variance one.
         """
         check_finite("features", check_plain("features", features))
-        flat = features.flatten(0, -2).double()
+        flat = features.detach().flatten(0, -2).double()
         mean, std = flat.mean(0), flat.std(0, correction=0)
         constant = (std <= 1e-6 * (1 + mean.abs())).nonzero().squeeze(-1).tolist()
         if constant:

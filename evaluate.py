@@ -251,12 +251,13 @@ def evaluate_checkpoints(settings: Settings, paths: list[Path]) -> tuple[Records
         runs.append((name, checkpoint, build.reload_task(checkpoint, *pools)))
     own, groups = own_strategies(settings), comparison.group_checkpoints(runs)
     for its_settings, task, _ in groups:
+        if settings["pool"]["test"] is not None:
+            build.refuse_own_pools(its_settings, build.human_of(its_settings, task))
         comparison.try_strategies(own, its_settings, task)
     records, trained = Records(), []
     for its_settings, task, learned in groups:
         test = None
         if settings["pool"]["test"] is not None:
-            build.refuse_own_pools(its_settings, build.human_of(its_settings, task))
             test = QueryPool.load(settings["pool"]["test"]).map_features(task.normalizer)
         records.entries += comparison.evaluate_task(its_settings, task, learned, test, own).entries
         for key, checkpoint in learned.items():

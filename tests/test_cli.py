@@ -317,7 +317,8 @@ BAD_INPUT = [
     ("train", "human=my_human:Tiring human.patients=3", "unexpected keyword argument 'patients'"),
     ("train", "question=weak question.threshold=-1", "question.threshold=-1: expected a finite"),
     ("train", "question=weak pool.options=3", "a weak question about 3 options: expected 2"),
-    ("train", "question=weak tau=optimal", "tau=optimal with Weak"),
+    ("train", "question=weak tau=optimal", "tau=optimal with question=weak:"),
+    ("train", "human=undecided", "human=undecided and question=choice, in which"),
     ("train", "policy.width=3", "width"),
     ("train", "algorithm=dqn", "Could not find 'algorithm/dqn'"),
     ("train", "algorithm.name=ppo", "type algorithm=ppo"),
@@ -452,6 +453,18 @@ def test_settings_that_a_checkpoint_brings_cannot_be_typed(tmp_path: Path) -> No
     assert process.returncode == 2
     assert "cut off" in errors
     assert errors.count("\n") == 1
+
+
+def test_whoever_weighs_steps_is_not_asked_about_an_own_pool(tmp_path: Path) -> None:
+    run("train.py", *TINY, "human=myopic", f"hydra.run.dir={tmp_path / 'run'}")
+    gridworld_pool(25, seed=77).save(tmp_path / "other.pt")
+    named = f"checkpoint={tmp_path / 'run'}", f"pool.test={tmp_path / 'other.pt'}"
+    process = start("evaluate.py", *named, f"hydra.run.dir={tmp_path / 'tables'}")
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert errors.startswith("error: human=myopic weighs the steps of trajectories")
+    assert errors.count("\n") == 1
+    assert not list((tmp_path / "tables").rglob("*"))
 
 
 def test_summary_is_plain_json(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from torchrl_pref.config.sections import Settings
 from torchrl_pref.errors import InputError
 from torchrl_pref.groups import find, make, where
 from torchrl_pref.pool import QueryPool
+from torchrl_pref.questions.base import Question
 from torchrl_pref.questions.responses import model_of
 from torchrl_pref.tasks.base import make_pool
 
@@ -21,9 +22,21 @@ def check_groups(settings: Settings) -> None:
     Raises:
         InputError: one cannot.
     """
+    section = settings["question"]
+    question: Question = make("question", section)
+    try:
+        _check_made(settings, question)
+    except InputError as error:
+        # The library knows what was made, and not what was typed for it.
+        named = f"question={section.get('make') or section['name']}"
+        raise InputError(str(error).replace(repr(question), named)) from None
+
+
+def _check_made(settings: Settings, question: Question) -> None:
+    """See :func:`check_groups`, for what can be answered."""
     own_pools = settings["pool"]["train"] is not None
     n_options = None if own_pools else settings["pool"]["options"]
-    question, tried = make("question", settings["question"]), None
+    tried = None
     if n_options is not None:
         question.answers(n_options)
         tried = _try_task(settings)

@@ -18,7 +18,7 @@ ask: install
 	.venv/bin/python ask.py $(ARGS)
 
 test: install
-	.venv/bin/python -m pytest -n auto
+	.venv/bin/python -m pytest -n auto --dist worksteal
 
 lint: install
 	.venv/bin/ruff check .

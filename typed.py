@@ -101,7 +101,9 @@ def refusals() -> Iterator[None]:
             "",
             " ".join(str(error).split()),
         )
-        raise InputError(f"{text}{_meant(text)}; --help lists the keys and their values") from None
+        raise InputError(
+            f"{_several(text) or text + _meant(text)}; --help lists the keys and their values"
+        ) from None
     except Exception as error:
         if Gate.passed or isinstance(error, (InputError, OSError)):
             raise
@@ -109,6 +111,18 @@ def refusals() -> Iterator[None]:
             f"{shlex.join(sys.argv[1:])}: cannot be read ({type(error).__name__}: {error}); --help "
             "lists the keys and their values"
         ) from None
+
+
+def _several(text: str) -> str | None:
+    """What is wrong with several values outside a sweep; None where that is not it."""
+    found = re.match(r"Ambiguous value for argument '([\w.+~/]+)=(.*?)'", text)
+    if found is None:
+        return None
+    key, values = found.groups()
+    return (
+        f"{key}={values}: several values; expected a list in brackets, as in '{key}=[{values}]', "
+        "or -m before it, to run with each of them"
+    )
 
 
 def _meant(text: str) -> str:

@@ -374,6 +374,7 @@ BAD_INPUT = [
     ("ask", "question=weak pool.options=3", "3 options"),
     ("ask", "tau=optimal", "tau=optimal"),
     ("ask", "study.attenton=2", "did you mean study.attention?"),
+    ("ask", "study.participants=P1,P2", "'study.participants=[P1,P2]'"),
     ("ask", "study.instructions=nowhere.md", "study.instructions=nowhere.md: "),
     ("ask", "study.participants=[P1,P1]", "study.participants"),
     ("ask", "resume=nowhere", "resume=nowhere: "),
@@ -441,29 +442,26 @@ def test_folders_that_the_user_made_are_kept(tmp_path: Path) -> None:
 def test_settings_that_a_checkpoint_brings_cannot_be_typed(tmp_path: Path) -> None:
     run("train.py", *TINY, f"hydra.run.dir={tmp_path}")
     for script, typed in (("evaluate.py", "checkpoint"), ("train.py", "resume")):
-        process = start(script, f"{typed}={tmp_path}", "belief.samples=50")
-        _, errors = process.communicate(timeout=60)
-        assert process.returncode == 2
-        assert errors.startswith("error: belief.samples=50: ")
-        assert "remove belief.samples" in errors
+        done = run_script(script, f"{typed}={tmp_path}", "belief.samples=50")
+        assert done.returncode == 2
+        assert done.stderr.startswith("error: belief.samples=50: ")
+        assert "remove belief.samples" in done.stderr
     content = (tmp_path / "checkpoint.pt").read_bytes()
     (tmp_path / "checkpoint.pt").write_bytes(content[: len(content) // 2])
-    process = start("train.py", f"resume={tmp_path}")
-    _, errors = process.communicate(timeout=60)
-    assert process.returncode == 2
-    assert "cut off" in errors
-    assert errors.count("\n") == 1
+    done = run_script("train.py", f"resume={tmp_path}")
+    assert done.returncode == 2
+    assert "cut off" in done.stderr
+    assert done.stderr.count("\n") == 1
 
 
 def test_whoever_weighs_steps_is_not_asked_about_an_own_pool(tmp_path: Path) -> None:
     run("train.py", *TINY, "human=myopic", f"hydra.run.dir={tmp_path / 'run'}")
     gridworld_pool(25, seed=77).save(tmp_path / "other.pt")
     named = f"checkpoint={tmp_path / 'run'}", f"pool.test={tmp_path / 'other.pt'}"
-    process = start("evaluate.py", *named, f"hydra.run.dir={tmp_path / 'tables'}")
-    _, errors = process.communicate(timeout=60)
-    assert process.returncode == 2
-    assert errors.startswith("error: human=myopic weighs the steps of trajectories")
-    assert errors.count("\n") == 1
+    done = run_script("evaluate.py", *named, f"hydra.run.dir={tmp_path / 'tables'}")
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: human=myopic weighs the steps of trajectories")
+    assert done.stderr.count("\n") == 1
     assert not list((tmp_path / "tables").rglob("*"))
 
 

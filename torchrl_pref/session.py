@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
+from torchrl_pref.acquisition.scoring import predict_answers
 from torchrl_pref.asking import (
     Asked,
     NothingToAsk,
@@ -166,6 +167,19 @@ class Session(Learned):
         assert self._asked is not None
         options, model = self.pool.features[self._asked], self._belief.response_model
         return self._plain(expected_gain(self._states[-1]["samples"], options, model))
+
+    @property
+    def answer_probabilities(self) -> Tensor:
+        """(B R), how probable each answer to the present question is held to be.
+
+        Raises:
+            NothingToAsk: there is no question left.
+        """
+        self.ask()
+        assert self._asked is not None
+        options, samples = self.pool.features[self._asked], self._states[-1]["samples"]
+        predicted = predict_answers(samples, options.unsqueeze(1), self._belief.response_model)
+        return self._plain(predicted.probs.mean(-2).squeeze(1))
 
     def tell(self, answer: int | Sequence[int | None] | None) -> None:
         """Let in the answer to the question that :meth:`ask` gave.

@@ -45,9 +45,9 @@ def test_a_random_sample_of_bad_settings_is_refused_in_one_line() -> None:
     """``benchmarks/bad_settings.py`` runs all of them."""
     commands = every_command()
     assert len(set(commands)) >= 2000
-    results = [run_forked(*one) for one in random.Random(0).sample(commands, 60)]
+    results = [run_forked(*one) for one in random.Random(0).sample(commands, 40)]
     assert [result for result in results if result.outcome in FAULTS] == []
-    assert sum(result.outcome == "refused" for result in results) > 40
+    assert sum(result.outcome == "refused" for result in results) > 25
 
 
 @pytest.mark.parametrize("algorithm", ["a2c", "ppo"])

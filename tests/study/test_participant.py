@@ -7,16 +7,18 @@ from pathlib import Path
 import pytest
 import torch
 from study_helpers import answer_all, careful, client_of, materials_of, study_of
+from tensordict import TensorDictBase
 from torch import Generator
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from torchrl_pref.asking import draw_questions, make_env, strategy_of
+from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.envs.transition import begin
 from torchrl_pref.errors import InputError
 from torchrl_pref.groups import make
-from torchrl_pref.humans.simulated import SimulatedHuman
 from torchrl_pref.questions.base import reordered
 from torchrl_pref.session import PRIME
-from torchrl_pref.strategies import STRATEGIES
 from torchrl_pref.study.participant import Participant
 from torchrl_pref.study.shown import ATTENTION, QUESTION, REPEAT
 from torchrl_pref.study.state import doubtful_answers, label_of, possible_answers, state_of
@@ -130,38 +132,57 @@ def test_who_sees_the_options_in_another_order_is_understood(
     study.close()
 
 
-def test_the_study_is_the_environment_bit_for_bit(tmp_path: Path) -> None:
+def env_of(study: Study, setup: str, seed: int) -> tuple[QueryEnv | FeedEnv, TensorDictBase]:
+    """The batched environment with a person who answers as the study thinks, about to be asked what
+    the study asks a participant with this seed."""
+    materials = study.materials
+    section, model = materials.settings["belief"], materials.response_model
+    belief = make("belief", section, model, without=("lapse",))
+    budget = materials.settings["setup"]["budget"]
+    env = make_env(
+        materials.pool, belief, setup, 1, seed, budget=budget, repeats=False, offers=None
+    )
+    questions = draw_questions(env, 1, repeats=False)
+    frame = env.reset()
+    samples = belief.prior(1, 4, Generator().manual_seed(seed))
+    for key, value in begin(samples, budget, 2).items():
+        frame["session", key] = value
+    frame["samples"], frame["mean"] = samples, frame["session", "mean"]
+    for key, value in questions.items():
+        frame[key] = value
+        frame["offer"] = materials.pool.features[value[:, 0]]
+    return env, frame
+
+
+@pytest.mark.parametrize("setup", ["query", "feed"])
+@pytest.mark.parametrize(("strategy", "lapse"), [("alignment_gain", 0), ("policy", 0.05)])
+def test_the_study_is_the_environment_bit_for_bit(
+    tmp_path: Path, setup: str, strategy: str, lapse: float
+) -> None:
     """A Boltzmann person who answers over HTTP, and the same one in the batched environment, with
     the same luck: the same questions, the same answers, the same belief."""
-    study = study_of(tmp_path, "setup.budget=12", "belief.lapse=0")
+    typed = f"setup={setup}", "setup.budget=12", f"belief.lapse={lapse}", f"strategy={strategy}"
+    study = study_of(tmp_path, *typed)
     materials, client = study.materials, client_of(study)
     person = client.post("/api/join", json={"code": "P1"}).json()
     seed = study.people["P1"].seed
-    belief = make(
-        "belief", materials.settings["belief"], materials.response_model, without=("lapse",)
-    )
-    human = SimulatedHuman(materials.response_model)
-    env = QueryEnv(materials.pool, human, belief, 12, repeats=False, batch_size=(1,), seed=5)
-    strategy = STRATEGIES["alignment_gain"](env)
-    frame = env.reset()
-    samples = belief.prior(1, 4, Generator().manual_seed(seed))
-    for key, value in begin(samples, 12, 2).items():
-        frame["session", key] = value
-    frame["samples"], frame["mean"] = samples, frame["session", "mean"]
+    env, frame = env_of(study, setup, seed)
+    asks = strategy_of(strategy, env)
     who = {key: value.clone() for key, value in frame["human"].items()}
     for turn in range(12):
         asked, shown = study.people["P1"].session.ask(), study.people["P1"].shown
         assert shown is not None
-        luck = torch.tensor([turn])
-        answer = int(human.respond(asked.features.unsqueeze(0), who, luck))
+        answer = int(env.human.respond(asked.features.unsqueeze(0), who, torch.tensor([turn])))
         meant = reordered(materials.question, shown.order)
         assert meant is not None
         body = {"code": "P1", "key": person["question"]["key"], "answer": meant.index(answer)}
         person = client.post("/api/answer", json={**body, "seconds": 1, "replays": 0}).json()
-        frame = strategy(frame)
-        assert int(frame["action"]) == int(asked.query)
-        env.generator.manual_seed(seed * PRIME + turn)
-        frame = env.step_mdp(env.step(frame))
+        while int(frame["session", "n_asked"]) == turn:
+            with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+                frame = asks(frame)
+            env.generator.manual_seed(seed * PRIME + turn)
+            frame = env.step_mdp(env.step(frame))
+        assert int(frame["session", "history", "index"][0, turn]) == int(asked.query)
         assert int(frame["session", "history", "answers"][0, turn]) == answer
         assert torch.equal(frame["samples"][0], study.people["P1"].session.samples)
     assert person["phase"] == "end"

@@ -83,14 +83,15 @@ def score_queries(
     """
     constants = compiled_constants(response_model)
     functions = acquisition.functions if isinstance(acquisition, Together) else (acquisition,)
-    known = not response_model.lapse and all(each in COMPILED for each in functions)
+    known = all(each in COMPILED for each in functions)
     if constants is None or not known or not (_is_plain(samples) and _is_plain(queries)):
         return score_in_tensors(samples, queries, response_model, acquisition)
     if response_model.is_plain:
         scores = compiled_scores(samples, queries, *constants)
     else:
         tables = response_model.tables(queries.shape[2], queries.device)
-        scores = compiled_table_scores(samples, queries, *tables, response_model.scale, *constants)
+        model = response_model.scale, *constants, response_model.lapse
+        scores = compiled_table_scores(samples, queries, *tables, *model)
     if not isinstance(acquisition, Together):
         return scores[..., COMPILED.index(acquisition)]
     if functions == COMPILED:

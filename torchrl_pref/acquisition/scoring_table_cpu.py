@@ -51,6 +51,7 @@ def compiled_table_scores(
     scale: float,
     tau: float,
     tolerance: float,
+    lapse: float,
 ) -> Tensor:
     """Information gain, alignment gain and volume removal of every candidate.
 
@@ -62,6 +63,7 @@ def compiled_table_scores(
         scale: what a return of 1 is in logits, the unit of the offsets.
         tau: what the returns are multiplied by; infinite for answers without error.
         tolerance: of answers without error: gaps this small are ties.
+        lapse: probability of an answer at random.
 
     Returns:
         (S C 3).
@@ -72,7 +74,7 @@ def compiled_table_scores(
     tables = factors.contrasts, factors.offsets * (unit / scale), factors.of_answer, log_weights
     given = samples, directions(samples), shared, scores, *tables
     arrays = [t.detach().contiguous().numpy() for t in given]
-    constants = unit, math.isinf(tau), np.float32(tolerance)
+    constants = unit, math.isinf(tau), np.float32(tolerance), lapse
     over_sessions(_score_sessions, len(samples), *arrays, *constants)
     return scores
 
@@ -92,6 +94,7 @@ def _score_sessions(
     unit: float,
     hard: bool,
     tolerance: float,
+    lapse: float,
 ) -> None:
     """Fill ``scores`` (S C 3); there are queries (1 C K D) for all or (S C K D) for each. Samples
     are ``pointed`` (S M D) where their directions count."""
@@ -122,7 +125,7 @@ def _score_sessions(
                 else:
                     _factor(*gaps, likely[u], logs[u], scratch[0, 0], scratch[1, 0])
             given = likely, logs, of_answer, same, log_weights, scratch
-            scores[s, c] = _gains(*given, centred)
+            scores[s, c] = _gains(*given, centred, lapse)
 
 
 @compiled
@@ -219,6 +222,7 @@ def _gains(
     log_weights: Array,
     scratch: Array,
     centred: Array,
+    lapse: float,
 ) -> tuple[float, float, float]:
     """The scores from the factors' probabilities (U M) and their logarithms (U M).
 
@@ -241,13 +245,29 @@ def _gains(
             length += moved * moved
         weight = math.exp(log_weights[r]) / n_samples
         mean = weight * total
-        entropy -= weight * weighed + mean * log_weights[r]
+        if lapse == 0.0:
+            entropy -= weight * weighed + mean * log_weights[r]
+        else:
+            at_random, weight = lapse / n_answers, (1.0 - lapse) * weight
+            mean = at_random + (1.0 - lapse) * mean
+            shares = np.float32(at_random), np.float32(weight * n_samples)
+            entropy += _entropy_of_mixed(product, *shares) / n_samples
         if mean > 0:
             of_mean -= mean * math.log(mean)
         squares += mean * mean
         gain += weight * weight * length / max(mean, 1e-30)
     gained = min(max((of_mean - entropy) / math.log(2), 0.0), math.log2(n_answers))
     return gained, gain, 1.0 - squares
+
+
+@compiled
+def _entropy_of_mixed(product: Array, at_random: float, weight: float) -> float:
+    """The sum over samples of -p log p, where p is ``at_random`` + ``weight`` · product (M)."""
+    total = ZERO
+    for m in range(len(product)):
+        mixed = at_random + weight * product[m]
+        total -= mixed * _log(mixed)
+    return total
 
 
 @compiled
@@ -300,7 +320,7 @@ def _exp_minus(x: float) -> float:
 
 @compiled
 def _log(x: float) -> float:
-    """log(x) of float32 x from 1 on, exact at 1, in operations that take many x at once."""
+    """log(x) of positive float32 x, exact at 1, in operations that take many x at once."""
     bits = np.float32(x).view(np.int32)
     whole = np.float32((bits >> 23) - 127)
     part = np.int32((bits & 0x7FFFFF) | 0x3F800000).view(np.float32)

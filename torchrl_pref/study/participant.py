@@ -26,8 +26,8 @@ from torchrl_pref.study.shown import ATTENTION, QUESTION, REPEAT, Said, Shown
 CHECKS = {REPEAT: "repeats", ATTENTION: "attention"}
 """Settings that say how many there are, in the section ``study``."""
 
-MOST_FORESEEN = 6
-"""Answers that are thought about before they are given."""
+MOST_FORESEEN = 25
+"""Answers that are thought about before they are given: all orders of four options, and none."""
 
 APART = 3
 """Questions at least between one and its repetition."""
@@ -166,15 +166,15 @@ class Participant:
             self.go_to_next()
 
     def foresee(self) -> bool:
-        """Think out what follows one more of the answers that may be given to the open question.
+        """Think out what follows one more of the answers that may be given to the open question,
+        the most probable first.
 
         Returns:
             Whether there are answers left to think about.
         """
         if self.shown is None or self.shown.purpose != QUESTION:
             return False
-        possible = [*range(min(MOST_FORESEEN, len(self.session.answers))), None]
-        left = [answer for answer in possible if answer not in self.foreseen]
+        left = [answer for answer in self._expected() if answer not in self.foreseen]
         if left:
             branch = self.session.branch()
             branch.tell(left[0])
@@ -182,6 +182,14 @@ class Participant:
                 branch.ask()
             self.foreseen[left[0]] = branch
         return len(left) > 1
+
+    def _expected(self) -> list[int | None]:
+        """What may be said to the open question, the most probable first. That a person cannot say
+        is taken to be as probable as any answer is by chance."""
+        likely = self.session.answer_probabilities.tolist()
+        answers = [(-each, answer) for answer, each in enumerate(likely)]
+        ordered = sorted([*answers, (-1 / len(likely), None)], key=lambda one: one[0])
+        return [answer for _, answer in ordered][:MOST_FORESEEN]
 
     def meant(self, shown: Shown, said: int | None) -> int | None:
         """The answer in terms of options of one in terms of places."""

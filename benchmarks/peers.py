@@ -116,6 +116,11 @@ def aprel_belief(aprel: ModuleType, queries: Array, answers: Array, tau: float) 
 
 def aprel_queries(aprel: ModuleType, queries: Array) -> list[Any]:
     """APReL's query objects from features (N K D)."""
+    return [aprel.PreferenceQuery(aprel_trajectories(aprel, options)) for options in queries]
+
+
+def aprel_trajectories(aprel: ModuleType, features: Array) -> Any:
+    """APReL's set of trajectories from features (N D)."""
 
     class Features:
         """An APReL environment whose trajectories are their own features."""
@@ -124,10 +129,7 @@ def aprel_queries(aprel: ModuleType, queries: Array) -> list[Any]:
         def features(trajectory: Array) -> Array:
             return trajectory
 
-    return [
-        aprel.PreferenceQuery([aprel.Trajectory(Features, option) for option in options])
-        for options in queries
-    ]
+    return aprel.TrajectorySet([aprel.Trajectory(Features, each) for each in features])
 
 
 def choose_by_aprel(aprel: ModuleType, belief: Any, queries: list[Any]) -> Callable[[], int]:

@@ -3,6 +3,7 @@
 from torchrl_pref.tasks.base import Task
 from torchrl_pref.tasks.driver import DriverTask
 from torchrl_pref.tasks.files import FilesTask
+from torchrl_pref.tasks.gaussian import GaussianTask
 from torchrl_pref.tasks.gridworld import GridworldTask
 from torchrl_pref.tasks.gymnasium import GymnasiumTask
 from torchrl_pref.tasks.lds import LDSTask
@@ -15,6 +16,7 @@ TASKS: dict[str, type[Task]] = {
     "lds": LDSTask,
     "gymnasium": GymnasiumTask,
     "torchrl": TorchRLTask,
+    "gaussian": GaussianTask,
     "files": FilesTask,
     "minari": MinariTask,
 }

@@ -26,7 +26,6 @@ from tqdm import tqdm
 from benchmarks.common import Row, arguments, report, start
 from benchmarks.served import GONE, WATCHED, Server
 
-
 TRIED = {"kill -9": 200, "double submits": 50, "other tab": 20, "reloads": 20}
 """What has to happen at least in 200 kills, for the run to say anything."""
 

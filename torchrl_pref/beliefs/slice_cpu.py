@@ -226,12 +226,14 @@ def _search(
     """Angles (M) in the slices: proposals on the arcs, which shrink to each one that is refused."""
     n = circles.shape[2]
     turn, angle, cosine, sine = np.zeros(n), np.empty(n), np.ones(n), np.zeros(n)
-    odds = odds.copy()
+    lapses = np.any(floors > 0)
+    if lapses:
+        odds = odds.copy()
     level = _surprise(circles, raised, ends, floors, odds, cosine, sine, hard, tolerance)
     for m in range(n):
         level[m] = power * level[m] - meridians * _log(abs(pole[1, m]))
         level[m] = min(level[m] - _log(1.0 - uniform[m, 1]), 1e300)  # the impossible stays above
-    if hard and not np.any(floors > 0):
+    if hard and not lapses:
         _cut_arcs(arcs, circles, raised, tolerance)
     left, refused = np.arange(n), np.empty(n, np.int64)
     for i in range(2, uniform.shape[1]):
@@ -253,8 +255,9 @@ def _search(
                 n += 1
         if n == 0:
             break
-        for j in range(n):
-            odds[j] = odds[refused[j]]
+        if lapses:
+            for j in range(n):
+                odds[j] = odds[refused[j]]
         for g in range(len(raised)):
             for j in range(n):
                 circles[0, g, j] = circles[0, g, refused[j]]
@@ -324,7 +327,7 @@ def _surprise(
             for j in range(n):
                 alone = total[j] - before[j]
                 total[j] = before[j] - math.log(math.exp(-alone) + floors[e] * odds[j])
-        if floors[e] >= 0:
+        if lapses and floors[e] >= 0:
             for j in range(n):
                 before[j] = total[j]
     for j in range(n):

@@ -51,8 +51,8 @@ class QueryEnv(SessionEnv):
         batch: n, questions asked at once; the budget is a multiple of it.
 
     Raises:
-        InputError: a number is below its minimum, the budget is no multiple of the batch, or without
-            repeats the candidates are too few.
+        InputError: a number is below its minimum, the budget is no multiple of the batch, or
+            without repeats the candidates are too few.
     """
 
     def __init__(

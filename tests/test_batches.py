@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from conftest import RESPONSE_MODELS
-from envs.test_batches import env_of
+from envs.test_batch_env import env_of
 from torch import Generator
 
 from torchrl_pref.acquisition.batch import BATCHES, OF_PAIRS, Shortlist, joint, top

@@ -138,6 +138,20 @@ def test_joint_goes_on_where_combinations_are_too_many(monkeypatch: pytest.Monke
     assert few >= 0.9 * values[0]
 
 
+def test_combinations_that_are_drawn_stand_for_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On average over the answers a belief is what it was before them."""
+    monkeypatch.setattr(batch, "CONFIGURATIONS", 256)
+    probs = shortlist(12, samples=10).probs.double()
+    share, likely = torch.ones(1).double(), torch.full((1, 10), 0.1).double()
+    for answers in probs:
+        share, likely = batch._followed(share, likely, answers)
+    assert len(share) == 256
+    assert float(share.sum()) == pytest.approx(1)
+    assert torch.allclose(likely.sum(1), torch.ones(256).double())
+    assert torch.allclose(share @ likely, torch.full((10,), 0.1).double(), atol=0.02)
+    assert likely.std(0).min() > 0.05
+
+
 def test_successive_elimination_is_the_naive_loop() -> None:
     for seed in range(3):
         best = shortlist(25, seed=seed)

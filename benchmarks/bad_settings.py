@@ -175,6 +175,9 @@ FLAGS += [
 ODD = {
     "train": [
         "setup.repeats=false setup.candidates=5 setup=query",
+        "setup.batch=5 setup=query",
+        "setup.batch=7 setup=query",
+        "setup.batch=2 setup=feed",
         "setup.repeats=false pool.size=5 setup=query",
         "setup.candidates=5 setup=feed",
         "setup.offers=30 setup=query",
@@ -213,6 +216,9 @@ ODD = {
         "tau=[noisy,[optimal]]",
         "objective=entropy",
         "setup.repeats=false setup=query pool.size=5",
+        "setup.batch=7 setup=query",
+        "setup.batch=10 setup=query policy=pretrained",
+        "setup.batch=10 protocol=heldout",
         "setup.candidates=5 setup=feed",
         "training.updates=5",
         "resume=.",

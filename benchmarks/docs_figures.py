@@ -328,6 +328,7 @@ PARTS: dict[str, Part] = {
         objectives,
     ),
     "tasks": Part("docs/results.md", tuple(chain(*(map(on_task, OTHER_TASKS)))), 20, tasks),
+    "batches": measured("batches", "docs/batches.md", 20),
     "answers": measured("answers", "docs/questions.md", 3, "--plot {folder}/answers.png"),
     "quality": Part(
         "docs/results.md",

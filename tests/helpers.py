@@ -81,6 +81,7 @@ def settings_of(setup: str = "feed", policy: str = "scorer", **training: Any) ->
             "on_skip": "new",
             "candidates": 8,
             "repeats": True,
+            "batch": 1,
         },
         "training": {
             "updates": 6,

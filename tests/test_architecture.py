@@ -21,6 +21,7 @@ ORDER = [
     "humans",
     "envs",
     "strategies",
+    "batches",
     "policies",
     "runs",
     "groups",

@@ -195,9 +195,10 @@ def make_query_env(
     candidates: int | None = None,
 ) -> QueryEnv:
     """The query environment on a normalised pool, by the sections ``setup`` and ``belief``."""
-    repeats = settings["setup"].get("repeats", True)
+    setup = settings["setup"]
     common = _session_arguments(settings, task, pool, sessions, seed)
-    return QueryEnv(pool, candidates=candidates, repeats=repeats, **common)
+    common |= {"repeats": setup.get("repeats", True), "batch": setup.get("batch", 1)}
+    return QueryEnv(pool, candidates=candidates, **common)
 
 
 def make_feed_env(

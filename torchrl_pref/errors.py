@@ -36,6 +36,20 @@ def check_count(name: str, value: Any, minimum: int) -> int:
     return value
 
 
+def check_batch(batch: int, budget: int) -> int:
+    """Return n, how many questions are asked at once, if the budget H is a multiple of it.
+
+    Raises:
+        InputError: it is not, or it is below 1.
+    """
+    if budget % check_count("setup.batch", batch, 1):
+        raise InputError(
+            f"setup.budget={budget} with setup.batch={batch}: expected a budget of whole batches; "
+            f"set setup.budget={batch * max(1, round(budget / batch))}, or another batch"
+        )
+    return batch
+
+
 def check_type(name: str, value: Any, kind: type, example: str) -> None:
     """Refuse a value that is not an object of ``kind``.
 

@@ -1,6 +1,7 @@
 """Strategies that are not learned: modules that read a session and write ``action``.
 
-Shapes: B sessions, C candidates, M belief samples, K options per query, D features.
+Shapes: B sessions, C candidates, M belief samples, K options per query, D features, n questions
+asked at once.
 
 A strategy is any TensorDictModule that writes ``action``; these and the learned policies run
 through the same ``env.rollout``.
@@ -38,20 +39,25 @@ class RandomQuery(TensorDictModuleBase):
 
     Args:
         seed: seeds the strategy's own generator.
+        batch: n, different candidates in one action.
     """
 
     in_keys = ["action_mask"]
     out_keys = ["action"]
 
-    def __init__(self, seed: int = 0) -> None:
+    def __init__(self, seed: int = 0, batch: int = 1) -> None:
         super().__init__()
+        self.batch = check_count("batch", batch, 1)
         self.generator = Generator().manual_seed(seed)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``action`` (B)."""
+        """Write ``action`` (B), or (B n) of a batch."""
         mask = tensordict["action_mask"]
         keys = torch.rand(mask.shape, generator=self.generator).to(mask.device)
-        return tensordict.set("action", keys.masked_fill(~mask, -1).argmax(-1))
+        keys = keys.masked_fill(~mask, -1)
+        if self.batch == 1:
+            return tensordict.set("action", keys.argmax(-1))
+        return tensordict.set("action", keys.topk(self.batch, -1).indices)
 
 
 class Greedy(TensorDictModuleBase):
@@ -284,7 +290,7 @@ MakeStrategy = Callable[[EnvBase], TensorDictModuleBase]
 """From an environment to what asks in it."""
 
 STRATEGIES: dict[str, MakeStrategy] = {
-    "random": lambda env: RandomQuery(),
+    "random": lambda env: RandomQuery(batch=env.batch),
     **{name: partial(_greedy, acquisition=each) for name, each in ACQUISITIONS.items()},
     "lookahead": lambda env: Lookahead(env.belief.response_model),
 }

@@ -57,7 +57,7 @@ SECTIONS: dict[str, dict[str, Types]] = {
 }
 
 SETUPS: dict[str, dict[str, Types]] = {
-    "query": {"budget": WHOLE, "candidates": WHOLE + NONE, "repeats": FLAG},
+    "query": {"budget": WHOLE, "candidates": WHOLE + NONE, "repeats": FLAG, "batch": WHOLE},
     "feed": {"budget": WHOLE, "offers": WHOLE + NONE, "on_skip": TEXT},
 }
 

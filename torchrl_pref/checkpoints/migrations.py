@@ -45,6 +45,9 @@ def migrate(settings: Any) -> None:
     if isinstance(settings["human"], dict):
         settings["human"].setdefault("tau", None)
     settings.setdefault("demonstrations", {"count": 0, "alternatives": 10, "tau": None})
+    # There were no batches.
+    if isinstance(settings.get("setup"), dict) and settings["setup"].get("name") == "query":
+        settings["setup"].setdefault("batch", 1)
     settings.setdefault("question", {"name": "choice"})
     if isinstance(settings.get("belief"), dict):
         settings["belief"] = {"name": "sampled", "lapse": 0.0, **settings["belief"]}

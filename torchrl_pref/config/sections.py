@@ -54,6 +54,7 @@ class SetupSection(TypedDict):
     budget: int
     candidates: NotRequired[int | None]
     repeats: NotRequired[bool]
+    batch: NotRequired[int]
     offers: NotRequired[int | None]
     on_skip: NotRequired[str]
 

@@ -31,7 +31,7 @@ from torchrl_pref.config.checks import (
 )
 from torchrl_pref.config.memory import check_memory
 from torchrl_pref.config.sections import Plain, Settings
-from torchrl_pref.config.together import check_together
+from torchrl_pref.config.together import check_together, refuse_batches
 from torchrl_pref.errors import (
     InputError,
     check_choice,
@@ -102,6 +102,7 @@ SETUPS: dict[str, dict[str, Check]] = {
         "setup.budget": count(1),
         "setup.candidates": optional(count(1)),
         "setup.repeats": check_flag,
+        "setup.batch": count(1),
     },
     "feed": {
         "setup.budget": count(1),
@@ -187,6 +188,7 @@ def check_run(settings: Plain) -> Settings:
     """
     own = {key: value for key, value in settings.items() if key not in (*TRAIN_DOOR, "overrides")}
     check_keys(own, TASK | TRAINING, OF_TRAINING)
+    refuse_batches(own, "a policy that is learned")
     check_together(own)
     setup, policy = own["setup"], own["policy"]
     if setup["name"] == "feed" and policy.get("start") is not None:
@@ -209,6 +211,8 @@ def check_evaluate_settings(settings: Plain) -> Settings:
     if "policy" in settings:
         groups = {**groups, "policy": PRETRAINED}
     check_keys(settings, TASK | EVALUATE, groups)
+    if "policy" in settings:
+        refuse_batches(settings, "policy=pretrained")
     check_together(settings)
     if "policy" in settings:
         one_or_more(choice("noisy", "optimal"))("tau", settings["tau"])

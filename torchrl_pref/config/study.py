@@ -106,14 +106,15 @@ KEYS: dict[str, Check] = {
     "belief.lapse": check_share,
 }
 
-ONLY_SIMULATED = ("setup.candidates", "setup.repeats", "setup.on_skip")
-"""Of simulations alone: people see the whole pool, and nothing twice."""
+ONLY_SIMULATED = ("setup.candidates", "setup.repeats", "setup.batch", "setup.on_skip")
+"""Of simulations alone: people see the whole pool, one question at a time, and nothing twice."""
 
 SETUPS: dict[str, dict[str, Check]] = {
     "query": {
         "setup.budget": count(1, MOST_QUESTIONS),
         "setup.candidates": lambda name, value: None,
         "setup.repeats": lambda name, value: None,
+        "setup.batch": lambda name, value: None,
     },
     "feed": {
         "setup.budget": count(1, MOST_QUESTIONS),

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from typing import Any
 
 from torchrl_pref.config.sections import Plain
-from torchrl_pref.errors import InputError, check_count
+from torchrl_pref.errors import InputError, check_batch, check_count
 
 OF_ONE = ("approve", "own")
 """Kinds of question that may be about one option."""
@@ -31,6 +32,7 @@ def check_together(settings: Plain) -> None:
         )
     check_options(settings)
     budget = setup["budget"]
+    _check_batches(settings)
     if setup["name"] == "feed":
         if setup["offers"] is not None:
             check_count("setup.offers", setup["offers"], budget)
@@ -45,6 +47,31 @@ def check_together(settings: Plain) -> None:
         raise InputError(
             f"objective=entropy with belief.samples={belief['samples']}: expected at least 4, as "
             "the entropy is told by the third nearest sample; raise belief.samples"
+        )
+
+
+def _check_batches(settings: Plain) -> None:
+    """Refuse batches that the budget is no multiple of, or whose extra is not installed."""
+    batch = settings["setup"].get("batch", 1)
+    check_batch(batch, settings["setup"]["budget"])
+    if batch > 1 and find_spec("kmedoids") is None:
+        raise InputError(
+            f"setup.batch={batch}: kmedoids is not installed; install it by "
+            "pip install -c constraints.txt -e '.[batch]', or set setup.batch=1"
+        )
+
+
+def refuse_batches(settings: Plain, who: str) -> None:
+    """Refuse several questions at once of somebody who chooses one.
+
+    Raises:
+        InputError: they are asked for.
+    """
+    batch = settings["setup"].get("batch", 1)
+    if batch > 1:
+        raise InputError(
+            f"setup.batch={batch}: {who} chooses one query at a time; set setup.batch=1, or "
+            "compare batches by evaluate.py setup=query"
         )
 
 

@@ -1,6 +1,6 @@
 """What random actions are drawn from where some are not allowed.
 
-Shapes: B sessions, C candidates.
+Shapes: B sessions, C candidates, n questions asked at once.
 """
 
 from __future__ import annotations
@@ -19,9 +19,11 @@ class Table:
 
     Attributes:
         mask: (B C), candidates that may be asked; None before the first reset.
+        batch: n.
     """
 
     mask: Tensor | None = None
+    batch: int = 1
 
     def show(self, mask: Tensor, begun: Tensor | None = None) -> None:
         """Put candidates on the table, in all sessions or where they have begun (B 1)."""
@@ -47,11 +49,15 @@ class AllowedActions(Composite):
         return copy
 
     def rand(self, shape: torch.Size | None = None) -> TensorDictBase:
-        """An allowed action for each session, (… B)."""
+        """An allowed action for each session, (… B) or (… B n)."""
         allowed = None if self.table is None else self.table.mask
         inner, leading = self["action"], torch.Size(shape or ())
-        if allowed is None or inner.mask is not None or allowed.shape[:-1] != inner.shape:
+        n = 1 if self.table is None else self.table.batch
+        several = () if n == 1 else (n,)
+        if allowed is None or inner.mask is not None:
             return super().rand(leading)
-        drawn = allowed.float().repeat(leading.numel(), 1).multinomial(1).to(inner.device)
-        size = torch.Size((*leading, *inner.shape))
-        return TensorDict({"action": drawn.reshape(size)}, size, device=self.device)
+        if (*allowed.shape[:-1], *several) != tuple(inner.shape):
+            return super().rand(leading)
+        drawn = allowed.float().repeat(leading.numel(), 1).multinomial(n).to(inner.device)
+        drawn = drawn.reshape(*leading, *inner.shape)
+        return TensorDict({"action": drawn}, (*leading, *self.shape), device=self.device)

@@ -1,6 +1,6 @@
 """The paper's first question as an environment: which query of a pool to ask.
 
-Shapes: as in ``envs.session``.
+Shapes: as in ``envs.session``, and n questions asked at once.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from torchrl_pref.beliefs.base import BeliefBase
 from torchrl_pref.envs.allowed import AllowedActions, Table
 from torchrl_pref.envs.session import SessionEnv
 from torchrl_pref.envs.transition import SessionState, Tree
-from torchrl_pref.errors import InputError, check_count, check_flag
+from torchrl_pref.errors import InputError, check_batch, check_count, check_flag
 from torchrl_pref.humans.base import HumanBase
 from torchrl_pref.humans.demonstrations import Demonstrations
 from torchrl_pref.pool import QueryPool
@@ -26,6 +26,11 @@ class QueryEnv(SessionEnv):
     State: the belief. Action: the index of a candidate. Reward: what the answer adds to the
     objective; for the paper's it is the information gain in bits of the asked query,
     :math:`r = H(\omega \mid Q) - E_{q_i} H(\omega \mid q_i, Q)`. The episode ends after H answers.
+
+    With ``batch`` above 1 an action is n candidates of each session (B n), and a step asks them
+    all: whoever chooses knows none of the n answers. They are then let in one after the other, as
+    n steps would; the belief after a batch is, bit for bit, that after the same questions one by
+    one.
 
     Args:
         pool: the queries, normalised.
@@ -43,9 +48,11 @@ class QueryEnv(SessionEnv):
         device: where the tensors live.
         demonstrations: what each human shows before the first question; None is nothing.
         seen: (N K D), the options as the human sees them, where that is not as the belief does.
+        batch: n, questions asked at once; the budget is a multiple of it.
 
     Raises:
-        InputError: a number is below its minimum, or without repeats the candidates are too few.
+        InputError: a number is below its minimum, the budget is no multiple of the batch, or
+            without repeats the candidates are too few.
     """
 
     def __init__(
@@ -62,9 +69,11 @@ class QueryEnv(SessionEnv):
         device: torch.device | str = "cpu",
         demonstrations: Demonstrations | None = None,
         seen: Tensor | None = None,
+        batch: int = 1,
     ) -> None:
         common = budget, objective, batch_size, seed, device, demonstrations, seen
         super().__init__(pool, human, belief, *common)
+        self.batch = check_batch(batch, budget)
         self.n_candidates = len(pool)
         if candidates is not None:
             self.n_candidates = min(check_count("setup.candidates", candidates, 1), len(pool))
@@ -74,7 +83,7 @@ class QueryEnv(SessionEnv):
                 ": expected at least as many candidates as asks; raise one or lower the other"
             )
         self.repeats = check_flag("setup.repeats", repeats)
-        self._table = Table()
+        self._table = Table(batch=self.batch)
         self._make_specs(self.n_candidates)
 
     def draw_questions(self, size: int) -> dict[str, Tensor]:
@@ -123,19 +132,24 @@ class QueryEnv(SessionEnv):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         index = self._check_action(tensordict, self.n_candidates, "the place of a candidate")
         hidden, session = self._session_of(tensordict)
+        index = index.reshape(-1, self.batch)
         if not self._shows_all:
-            index = hidden["candidates"].gather(-1, index.unsqueeze(-1)).squeeze(-1)
+            index = hidden["candidates"].gather(-1, index)
         if not self.repeats:
             self._check_new(session, index)
         human, going_on = hidden["human"], session["n_asked"].squeeze(-1) < self.budget
-        after = self._ask(session, human, index, going_on)
+        after = session
+        for query in index.unbind(-1):
+            after = self._ask(after, human, query, going_on)
         reward = self._objective.gained(session, after, human)
         terminated = after["n_asked"] >= self.budget
         return self._finish(after, hidden, reward, torch.zeros_like(terminated), terminated)
 
     def _check_new(self, session: SessionState, index: Tensor) -> None:
-        """Refuse to ask pool query ``index`` (B) again in a session that goes on."""
-        again = (session["history"]["index"] == index.unsqueeze(-1)).any(-1, keepdim=True)
+        """Refuse to ask pool queries ``index`` (B n) again in a session that goes on."""
+        told = torch.cat([session["history"]["index"], index], -1)
+        before = (told.unsqueeze(-2) == index.unsqueeze(-1)).sum(-1) > 1  # each is among them once
+        again = before.any(-1, keepdim=True)
         if (again & (session["n_asked"] < self.budget)).any():
             raise InputError(
                 "action: a query that was asked before, where repeats=False; expected one that "

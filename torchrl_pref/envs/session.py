@@ -77,6 +77,9 @@ class SessionEnv(EnvBase):
 
     _supports_set_state = True
 
+    batch = 1
+    """n, questions that one action asks."""
+
     def __init__(
         self,
         pool: QueryPool,
@@ -136,9 +139,14 @@ class SessionEnv(EnvBase):
 
     def _choice_of(self, n_actions: int) -> Composite:
         """The spec of an action."""
-        batch, device = self.batch_size, self.device
-        action = Categorical(n_actions, shape=batch, device=device)
-        return Composite(action=action, shape=batch, device=device)
+        device = self.device
+        action = Categorical(n_actions, shape=self._action_shape, device=device)
+        return Composite(action=action, shape=self.batch_size, device=device)
+
+    @property
+    def _action_shape(self) -> torch.Size:
+        """(B), or (B n) where an action asks several questions."""
+        return self.batch_size if self.batch == 1 else torch.Size((*self.batch_size, self.batch))
 
     def _set_seed(self, seed: int | None) -> None:
         """Without a seed humans are new ones each time, in whatever process."""
@@ -158,7 +166,7 @@ class SessionEnv(EnvBase):
     @property
     def max_steps(self) -> int:
         """Steps after which every session has ended."""
-        return self.budget
+        return self.budget // self.batch
 
     def _reset(
         self, tensordict: TensorDictBase | None = None, set_state: bool = False, **kwargs: Any
@@ -270,9 +278,10 @@ class SessionEnv(EnvBase):
             self._remembered = remembered
 
     def _check_action(self, tensordict: TensorDictBase, n_actions: int, meaning: str) -> Tensor:
-        """The action (B) of each session; refused unless it is from 0 to ``n_actions`` - 1."""
+        """The action of each session; refused unless it is from 0 to ``n_actions`` - 1."""
         action = check_range("action", tensordict.get("action"), 0, n_actions - 1, meaning)
-        check_shape("action", action, self.batch_size, "one number for each session")
+        each = "one number" if self.batch == 1 else f"{self.batch} numbers"
+        check_shape("action", action, self._action_shape, f"{each} for each session")
         return action
 
     def _ask(

@@ -9,7 +9,9 @@ from typing import Any, cast
 import torch
 from tqdm import tqdm
 
+from torchrl_pref.acquisition.batch import BATCHES, OF_PAIRS
 from torchrl_pref.acquisition.functions import alignment_gain
+from torchrl_pref.batches import BATCH_STRATEGIES
 from torchrl_pref.build import load_policy, make_feed_env, make_query_env
 from torchrl_pref.checkpoints.checkpoint import Checkpoint
 from torchrl_pref.config.memory import check_memory
@@ -98,6 +100,7 @@ def compare(
     """Baselines and learned policies on the same humans and luck.
 
     Random and greedy choose from the whole pool, as in the paper's Figure 1, whatever the setup.
+    Where several queries are asked at once, what chooses batches takes the place of greedy.
 
     Args:
         settings: the sections ``setup``, ``belief``, ``evaluation`` and ``device``.
@@ -107,18 +110,16 @@ def compare(
         own: what makes the strategies of the user; they are made for the setup of the settings.
 
     Returns:
-        By key: ``random``, ``greedy_information``, ``greedy_alignment``, for a feed also
-        ``ask_all`` and ``quantile_alignment``, the learned ones and those of the user.
+        By key: ``random``, ``greedy_information`` and ``greedy_alignment``, or ``batch_top`` and so
+        on; for a feed also ``ask_all`` and ``quantile_alignment``; the learned ones and those of
+        the user.
     """
     n_humans, seed = check_evaluation(settings)
     humans = draw_humans(make_query_env(settings, task, pool, n_humans, seed))
     runs: list[tuple[QueryEnv | FeedEnv, Entrant]] = []
 
     query_env = make_query_env(settings, task, pool, n_humans, seed)
-    runs.append((query_env, Entrant("random", RandomQuery(seed + 1))))
-    runs.append((query_env, Entrant("greedy_information", Greedy(task.response_model))))
-    by_alignment = Greedy(task.response_model, alignment_gain)
-    runs.append((query_env, Entrant("greedy_alignment", by_alignment)))
+    runs += [(query_env, entrant) for entrant in _baselines(query_env, task, seed)]
     if settings["setup"]["name"] == "feed":
         feed_env = make_feed_env(settings, task, pool, n_humans, seed)
         runs.append((feed_env, Entrant("ask_all", RandomAsk())))
@@ -138,6 +139,17 @@ def compare(
         torch.manual_seed(seed)
         results[entrant.key] = evaluate(env, entrant.strategy, humans, entrant.sample)
     return results
+
+
+def _baselines(env: QueryEnv, task: Problem, seed: int) -> list[Entrant]:
+    """What chooses from the whole pool and is not learned: one query, or several at once."""
+    entrants = [Entrant("random", RandomQuery(seed + 1, env.batch))]
+    if env.batch > 1:
+        several = env.features.shape[1] > 2
+        names = [name for name in BATCHES if not (several and name in OF_PAIRS)]
+        return entrants + [Entrant(f"batch_{name}", BATCH_STRATEGIES[name](env)) for name in names]
+    entrants.append(Entrant("greedy_information", Greedy(task.response_model)))
+    return [*entrants, Entrant("greedy_alignment", Greedy(task.response_model, alignment_gain))]
 
 
 def _load_policy(

@@ -1,8 +1,9 @@
 """Strategies of the user, named as ``module:name``, to be judged beside ours.
 
 ``name`` is called with the environment, a :class:`QueryEnv` or a :class:`FeedEnv`, and gives a
-TensorDictModule that writes ``action``: for each session the number of a candidate, or 0 to skip
-and 1 to ask. Where it is a probabilistic actor its most likely action is taken.
+TensorDictModule that writes ``action``: for each session the number of a candidate (with
+``setup.batch=n`` the numbers of n), or 0 to skip and 1 to ask. Where it is a probabilistic actor
+its most likely action is taken.
 
 Only what the user typed is imported: names come from the command line and never from a file.
 """
@@ -85,6 +86,7 @@ def try_own(makers: Mapping[str, Maker], env: QueryEnv | FeedEnv) -> None:
         except Exception as error:
             raise InputError(
                 f"strategy={typed}: its first decision in a {type(env).__name__} fails "
-                f"({where(error)}); expected a TensorDictModule that writes action, one whole "
-                "number for each session"
+                f"({where(error)}); expected a TensorDictModule that writes action, "
+                f"{'one whole number' if env.batch == 1 else f'{env.batch} whole numbers'} for "
+                "each session"
             ) from error

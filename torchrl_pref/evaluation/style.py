@@ -27,6 +27,8 @@ class Kind(NamedTuple):
     """What is known of a kind of strategy."""
 
     style: Style
+    batch: bool = False
+    """Whether it chooses several queries to be asked at once."""
     feed: bool = False
     """Whether it decides on the offers of a feed, and does not choose from the whole pool."""
     baseline: str | None = None
@@ -56,6 +58,18 @@ KINDS: dict[str, Kind] = {
     ),
     "greedy_alignment": Kind(
         Style("greedy alignment", "#009e73", "-"), baseline="greedy_information"
+    ),
+    "batch_top": Kind(Style("the best at once", "#1f1f1f", "--"), batch=True, baseline="random"),
+    "batch_medoids": Kind(Style("medoids", "#8c510a", "-"), batch=True, baseline="batch_top"),
+    "batch_boundary_medoids": Kind(
+        Style("boundary medoids", "#e69f00", "-"), batch=True, baseline="batch_top"
+    ),
+    "batch_successive_elimination": Kind(
+        Style("successive elimination", "#0072b2", "-"), batch=True, baseline="batch_top"
+    ),
+    "batch_dpp": Kind(Style("DPP", "#cc79a7", "-"), batch=True, baseline="batch_top"),
+    "batch_joint": Kind(
+        Style("joint information", "#009e73", "-"), batch=True, baseline="batch_top"
     ),
     "ask_all": Kind(Style("ask all", "#000000", ":"), feed=True),
     "threshold": Kind(Style("threshold in bits", "#e69f00", "-."), feed=True, baseline="ask_all"),

@@ -11,7 +11,15 @@ from tabulate import tabulate
 from torch import Tensor
 
 from torchrl_pref.evaluation.records import Records
-from torchrl_pref.evaluation.style import LEARNED, baseline_of, is_feed, is_judged, kind_of, name_of
+from torchrl_pref.evaluation.style import (
+    KINDS,
+    LEARNED,
+    baseline_of,
+    is_feed,
+    is_judged,
+    kind_of,
+    name_of,
+)
 from torchrl_pref.evaluation.views import (
     alignment,
     answers_to_reach,
@@ -33,7 +41,7 @@ def tables(records: Records) -> str:
     for task in records.tasks:
         own = records.of_task(task)
         parts += [f"{title_of(task)}: alignment, {counts(own)}", "", alignment_table(own), ""]
-        parts += feed_note(own)
+        parts += [*feed_note(own), *batch_note(own)]
         if any(map(is_judged, own.strategies)):
             parts += ["differences on the same humans [95%]", "", difference_table(own), ""]
         parts += ["after the last query", "", detail_table(own), ""]
@@ -155,6 +163,13 @@ def feed_note(records: Records) -> list[str]:
         return []
     verb = "decides" if len(feed) == 1 else "decide"
     return [f"{', '.join(feed)} {verb} on the offers of a feed; the others have the whole pool", ""]
+
+
+def batch_note(records: Records) -> list[str]:
+    """What a number of answers means where queries are asked several at once."""
+    if not any(KINDS[kind_of(key)].batch for key in records.strategies):
+        return []
+    return ["queries are asked in batches: until the last answer of one, nothing is learned", ""]
 
 
 def few_samples(records: Records) -> list[str]:

@@ -1,0 +1,86 @@
+"""Strategies that choose n questions to be asked at once.
+
+Shapes: B sessions, C candidates, P of them that are worth most, M belief samples, K options per
+query, D features, n questions asked at once.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
+
+from torchrl_pref.acquisition.batch import BATCHES, Select, Shortlist, joint
+from torchrl_pref.acquisition.functions import Acquisition, information_gain
+from torchrl_pref.acquisition.scoring import predict_answers, score_queries
+from torchrl_pref.errors import check_count
+from torchrl_pref.questions.response_model import ResponseModel
+from torchrl_pref.strategies import MakeStrategy, RandomQuery
+
+
+class BatchOf(TensorDictModuleBase):
+    """Ask n allowed candidates that are worth much, chosen so that they ask different things.
+
+    Nothing is drawn: the same session is asked the same.
+
+    Args:
+        response_model: how the belief thinks the human answers.
+        batch: n; as many candidates are expected to be allowed.
+        select: chooses n of the best candidates, see ``acquisition.batch.BATCHES``.
+        acquisition: what a candidate is worth by itself; information gain by default.
+        shortlist: P/n, how many of the best candidates are chosen from for each that is asked. 20
+            is that of the literature.
+    """
+
+    in_keys = ["samples", "queries", "action_mask"]
+    out_keys = ["action"]
+
+    def __init__(
+        self,
+        response_model: ResponseModel,
+        batch: int,
+        select: Select = joint,
+        acquisition: Acquisition = information_gain,
+        shortlist: int = 20,
+    ) -> None:
+        super().__init__()
+        self.response_model = response_model
+        self.batch = check_count("batch", batch, 1)
+        self.select, self.acquisition = select, acquisition
+        self.shortlist = check_count("shortlist", shortlist, 1)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action`` (B n)."""
+        samples, queries, mask = (tensordict[key] for key in self.in_keys)
+        values = score_queries(samples, queries, self.response_model, self.acquisition)
+        values, order = values.masked_fill(~mask, -math.inf).sort(
+            dim=-1, descending=True, stable=True
+        )
+        length = min(self.shortlist * self.batch, order.shape[1])
+        actions = []
+        # One session at a time: what is chosen next depends on what was chosen before.
+        for b, allowed in enumerate(mask.sum(-1).tolist()):
+            best = order[b, : min(length, allowed)]
+            shown = queries[b, best]
+            predicted = predict_answers(samples[b : b + 1], shown.unsqueeze(0), self.response_model)
+            chosen = self.select(
+                Shortlist(values[b, : len(best)], shown, predicted.probs[0]), self.batch
+            )
+            actions.append(best[chosen])
+        return tensordict.set("action", torch.stack(actions))
+
+
+def _batch_of(env: EnvBase, select: Select) -> TensorDictModuleBase:
+    """What asks batches in an environment."""
+    return BatchOf(env.belief.response_model, env.batch, select)
+
+
+BATCH_STRATEGIES: dict[str, MakeStrategy] = {
+    "random": lambda env: RandomQuery(batch=env.batch),
+    **{name: partial(_batch_of, select=each) for name, each in BATCHES.items()},
+}
+"""Strategies that choose n candidates of an environment with ``batch=n``, by name."""

@@ -59,6 +59,8 @@ def make_own(makers: Mapping[str, Maker], env: QueryEnv | FeedEnv, seed: int) ->
         try:
             strategy = maker(env)
         except Exception as error:
+            if ":" not in typed:  # one of ours, which says so itself
+                raise
             raise InputError(
                 f"strategy={typed}: making it for a {type(env).__name__} fails ({where(error)}); "
                 "expected a function of the environment, or a class made with it"

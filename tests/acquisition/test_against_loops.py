@@ -143,23 +143,16 @@ def test_no_two_samples_differ_about_options_that_are_alike(generator: Generator
             assert values.max() < 1e-2
 
 
-def test_a_pair_beyond_the_first_ones_is_found(generator: Generator) -> None:
-    """Where only two samples near to each other prefer different options."""
-    samples = uniform_sphere((1, 80, 2), generator)
-    samples = samples[:, samples[0, :, 0].argsort()]
-    away = torch.tensor([[1.0, 0.0]]) * torch.linspace(-1.2, 1.2, 30).view(-1, 1)
-    # As option 0 less option 1 leads by ω₁ + a ω₂: each query cuts the circle elsewhere.
-    gap = torch.stack([torch.ones(30), 3 * away[:, 0]], -1)
-    queries = torch.stack([gap, torch.zeros_like(gap)], 1).unsqueeze(0)
-    narrow = torch.nn.functional.normalize(
-        samples[:, :, :] * 0.02 + torch.tensor([0.0, 1.0]), dim=-1
-    )
-    found = score_queries(narrow, queries / 50, Boltzmann(1.0), disagreement)[0]
-    for value, options in zip(found, queries[0] / 50, strict=True):
-        expected = by_loops(
-            "disagreement", narrow[0].double().numpy(), options.double().numpy(), 1.0
-        )
-        assert float(value) == pytest.approx(expected, abs=1e-6)
+def test_a_pair_that_is_not_among_the_farthest_is_found() -> None:
+    """Of a long row of samples and one beside its middle, which alone prefers the first option."""
+    row = torch.stack([torch.linspace(-1, 1, 40), torch.zeros(40), torch.ones(40)], -1)
+    samples = torch.cat([row, torch.tensor([[0.0, 0.3, 1.0]])])
+    samples = torch.nn.functional.normalize(samples, dim=-1)
+    options = torch.tensor([[0.0, 1.0, -0.15], [0.0, 0.0, 0.0]])
+    found = score_queries(samples[None], options[None, None], Boltzmann(1.0), disagreement)
+    expected = torch.linalg.vector_norm(samples[0] - samples[-1])
+    assert float(found) == pytest.approx(float(expected), abs=1e-6)
+    assert (torch.pdist(samples) > expected + 1e-3).sum() > 2 * len(samples)
 
 
 def test_knowledge_gradient_is_in_parts_what_it_is_as_a_whole(

@@ -43,7 +43,7 @@ def test_the_main_job_runs_with_it(what: str, tmp_path: Path) -> None:
 
 
 def test_strategies_are_rows_of_the_table(tmp_path: Path) -> None:
-    mine = "my_strategy:most_different", "my_acquisition:least_certain"
+    mine = "my_strategy:most_different", "my_acquisition:most_disputed"
     small = "pool.size=40", "setup=query", "setup.budget=3", "tau=noisy", "evaluation.humans=6"
     typed = f"strategy=[{','.join(mine)}]", f"hydra.run.dir={tmp_path / 'run'}"
     done = run("evaluate.py", *small, *typed)

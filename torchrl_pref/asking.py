@@ -17,12 +17,11 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl_pref.beliefs.base import BeliefBase
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
-from torchrl_pref.envs.session import is_feed
 from torchrl_pref.envs.transition import SessionState, Tree
 from torchrl_pref.errors import InputError, check_choice, check_type
 from torchrl_pref.humans.simulated import SimulatedHuman
 from torchrl_pref.pool import QueryPool
-from torchrl_pref.strategies import FEED_STRATEGIES, STRATEGIES, MakeStrategy
+from torchrl_pref.strategies import MakeStrategy, make_strategy
 
 
 class NothingToAsk(InputError):
@@ -86,8 +85,7 @@ def strategy_of(strategy: str | MakeStrategy, env: EnvBase) -> TensorDictModuleB
         kind = "noisy" if env.belief.response_model.is_soft else "optimal"
         return pretrained_policy(env, kind).strategy
     if isinstance(strategy, str):
-        known = FEED_STRATEGIES if is_feed(env) else STRATEGIES
-        return known[check_choice("strategy", strategy, (*known, "policy"))](env)
+        return make_strategy(strategy, env, "policy")
     if not callable(strategy) or isinstance(strategy, TensorDictModuleBase):
         raise InputError(
             f"strategy of type {type(strategy).__name__}: expected a function from an environment "

@@ -20,14 +20,14 @@ from torch import Generator, Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_pref.acquisition import ACQUISITIONS
-from torchrl_pref.acquisition.functions import (
-    Acquisition,
-    information_gain,
-)
+from torchrl_pref.acquisition.functions import Acquisition, information_gain
+from torchrl_pref.acquisition.knowledge_gradient import KnowledgeGradient
+from torchrl_pref.acquisition.pairs import max_regret
 from torchrl_pref.acquisition.scoring import moments_among, predict_answers, score_queries, together
 from torchrl_pref.beliefs.per_belief import PerBelief
+from torchrl_pref.envs.session import is_feed
 from torchrl_pref.envs.transition import OPEN
-from torchrl_pref.errors import check_count, check_share
+from torchrl_pref.errors import check_choice, check_count, check_share
 from torchrl_pref.questions.response_model import ResponseModel
 
 REFERENCE = 500
@@ -87,6 +87,35 @@ class Greedy(TensorDictModuleBase):
         )
         allowed = values.masked_fill(~tensordict["action_mask"], -math.inf)
         return tensordict.set("action", allowed.argmax(-1))
+
+
+class Thompson(TensorDictModuleBase):
+    """Draw two samples of the belief, and let a strategy decide as if there were no others.
+
+    Thompson sampling where options are compared (Novoseller, Wei, Sui, Yue and Burdick, *Dueling
+    posterior sampling for preference-based reinforcement learning*, 2020) shows the best trajectory
+    of each of two samples. Of queries that are there already, the one is asked by whose options the
+    two have most at stake: max regret of a belief in these two alone.
+
+    Args:
+        strategy: decides by two samples; greedily by max regret, or in a feed by its quantile.
+        seed: seeds the strategy's own generator.
+    """
+
+    out_keys = ["action"]
+
+    def __init__(self, strategy: TensorDictModuleBase, seed: int = 0) -> None:
+        super().__init__()
+        self.in_keys, self.strategy = strategy.in_keys, strategy
+        self.generator = Generator().manual_seed(seed)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action`` (B)."""
+        samples = tensordict["samples"]
+        keys = torch.rand(samples.shape[:2], generator=self.generator).to(samples.device)
+        drawn = keys.topk(min(2, keys.shape[1])).indices.unsqueeze(-1)
+        two = tensordict.select(*self.in_keys).set("samples", samples.take_along_dim(drawn, 1))
+        return tensordict.set("action", self.strategy(two)["action"])
 
 
 class Lookahead(TensorDictModuleBase):
@@ -286,12 +315,19 @@ def _greedy(env: EnvBase, acquisition: Acquisition) -> TensorDictModuleBase:
     return Greedy(env.belief.response_model, acquisition)
 
 
+def _by_knowledge(env: EnvBase) -> Acquisition:
+    """The knowledge gradient of whatever an environment's pool shows."""
+    return KnowledgeGradient(env.features.flatten(0, 1))
+
+
 MakeStrategy = Callable[[EnvBase], TensorDictModuleBase]
 """From an environment to what asks in it."""
 
 STRATEGIES: dict[str, MakeStrategy] = {
     "random": lambda env: RandomQuery(batch=env.batch),
     **{name: partial(_greedy, acquisition=each) for name, each in ACQUISITIONS.items()},
+    "knowledge_gradient": lambda env: _greedy(env, _by_knowledge(env)),
+    "thompson": lambda env: Thompson(_greedy(env, max_regret)),
     "lookahead": lambda env: Lookahead(env.belief.response_model),
 }
 """Strategies that choose from candidates, by name: greedy ones by that of what they maximise."""
@@ -299,5 +335,22 @@ STRATEGIES: dict[str, MakeStrategy] = {
 FEED_STRATEGIES: dict[str, MakeStrategy] = {
     "random": lambda env: RandomAsk(),
     **{name: partial(QuantileAsk, acquisition=each) for name, each in ACQUISITIONS.items()},
+    "knowledge_gradient": lambda env: QuantileAsk(env, _by_knowledge(env)),
+    "thompson": lambda env: Thompson(QuantileAsk(env, max_regret)),
 }
 """Strategies that ask or skip what is offered, by name: all that is offered, or the best share."""
+
+
+def make_strategy(name: str, env: EnvBase, *beside: str) -> TensorDictModuleBase:
+    """The strategy of that name in an environment's setup.
+
+    Args:
+        name: of the setup's table.
+        env: says which setup.
+        beside: what else the caller knows by name, for the message.
+
+    Raises:
+        InputError: there is none.
+    """
+    known = FEED_STRATEGIES if is_feed(env) else STRATEGIES
+    return known[check_choice("strategy", name, (*known, *beside))](env)

@@ -1,11 +1,12 @@
-"""An acquisition function of your own, asked greedily: the query whose answer is least certain.
+"""An acquisition function of your own, asked greedily: the query that samples are most split about.
 
-    python ../../evaluate.py strategy=my_acquisition:least_certain
+    python ../../evaluate.py strategy=my_acquisition:most_disputed
 
-It is a baseline to beat: a query may be uncertain because its options are nearly alike, of which
-nothing is learned.
+Each sample of the belief votes for the answer that it thinks likeliest (query by committee: Dagan
+and Engelson, 1995). It is a baseline to beat: it counts votes, and not how sure a sample is.
 """
 
+import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
@@ -14,11 +15,12 @@ from torchrl_pref.questions.response_model import Prediction
 from torchrl_pref.strategies import Greedy
 
 
-def least_confidence(predicted: Prediction, samples: Tensor) -> Tensor:
-    """One less the probability of the likeliest answer (… C), from what M samples predict."""
-    return 1 - predicted.probs.mean(-2).amax(-1)
+def vote_entropy(predicted: Prediction, samples: Tensor) -> Tensor:
+    """Entropy of the votes (… C), in nats, from what M samples predict."""
+    votes = torch.nn.functional.one_hot(predicted.probs.argmax(-1), predicted.probs.shape[-1])
+    return torch.special.entr(votes.to(samples).mean(-2)).sum(-1)
 
 
-def least_certain(env: QueryEnv) -> TensorDictModuleBase:
+def most_disputed(env: QueryEnv) -> TensorDictModuleBase:
     """A strategy for an environment."""
-    return Greedy(env.belief.response_model, least_confidence)
+    return Greedy(env.belief.response_model, vote_entropy)

@@ -6,14 +6,25 @@ import torch
 from torch import Generator
 
 from torchrl_pref.acquisition import ACQUISITIONS
-from torchrl_pref.acquisition.functions import Acquisition
+from torchrl_pref.acquisition.functions import (
+    Acquisition,
+    least_confidence,
+    volume_removal,
+)
+from torchrl_pref.acquisition.knowledge_gradient import KnowledgeGradient
 from torchrl_pref.acquisition.scoring import score_in_tensors, score_queries
 from torchrl_pref.beliefs.sampled import uniform_sphere
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.questions.responses import Boltzmann, Optimal
 from torchrl_pref.questions.weak import Weak
 
-FUNCTIONS = [*ACQUISITIONS.values(), my_acquisition.least_confidence]
+TRAJECTORIES = torch.randn(30, 4, generator=Generator().manual_seed(1))
+FUNCTIONS = [
+    *ACQUISITIONS.values(),
+    KnowledgeGradient(TRAJECTORIES),
+    my_acquisition.vote_entropy,
+]
+NOT_ZERO_WHERE_ALIKE = volume_removal, least_confidence
 MODELS = [Boltzmann(4.0), Optimal(), Boltzmann(1e5), Boltzmann(4.0, Weak(0.5), lapse=0.1)]
 
 
@@ -37,3 +48,21 @@ def test_values(function: Acquisition, model: ResponseModel, generator: Generato
     # Nothing is to be had where the belief is certain, and less than from a query that splits it.
     certain = score_queries(samples[:, :1].expand(3, 40, 4), queries, model, function)
     assert certain[1:].mean() <= found[1:].mean() + 1e-6
+
+
+@pytest.mark.parametrize("n_options", [2, 3, 4])
+@pytest.mark.parametrize("function", FUNCTIONS)
+def test_options_that_are_alike_are_worth_nothing(
+    function: Acquisition, n_options: int, generator: Generator
+) -> None:
+    """Or, of what is about the answer alone, most of all: nobody knows what it will be."""
+    samples = uniform_sphere((3, 40, 4), generator)
+    queries = torch.randn(3, 7, n_options, 4, generator=generator)
+    alike = queries[:, :, :1].expand_as(queries)
+    for model in (Boltzmann(0.001), Boltzmann(4.0), Boltzmann(1e5), Optimal()):
+        found = score_queries(samples, alike, model, function)
+        if function not in NOT_ZERO_WHERE_ALIKE:
+            assert found.abs().max() < 1e-6
+        else:
+            assert torch.allclose(found, torch.tensor(1 - 1 / n_options))
+            assert (score_queries(samples, queries, model, function) <= found + 1e-6).all()

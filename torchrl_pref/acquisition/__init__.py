@@ -4,12 +4,18 @@ from torchrl_pref.acquisition.functions import (
     Acquisition,
     alignment_gain,
     information_gain,
+    least_confidence,
     volume_removal,
 )
+from torchrl_pref.acquisition.pairs import disagreement, max_regret
 
 ACQUISITIONS: dict[str, Acquisition] = {
     "information_gain": information_gain,
     "alignment_gain": alignment_gain,
     "volume_removal": volume_removal,
+    "max_regret": max_regret,
+    "disagreement": disagreement,
+    "least_confidence": least_confidence,
 }
-"""The acquisition functions by name."""
+"""The acquisition functions by name. A :class:`KnowledgeGradient` is made of a pool, and so no line
+here."""

@@ -51,9 +51,27 @@ def volume_removal(predicted: Prediction, samples: Tensor) -> Tensor:
         samples: (… M D), the belief samples; not needed here.
 
     Returns:
-        (… C), between 0 and 1 - 1/R.
+        (… C), between 0 and 1 - 1/R. It is not 0 where options are alike, and even greatest there:
+        it is about how uncertain the answer is, be it for want of knowledge or by chance.
     """
     return 1 - predicted.probs.mean(-2).square().sum(-1)
+
+
+def least_confidence(predicted: Prediction, samples: Tensor) -> Tensor:
+    r"""How likely the likeliest answer is not to be given, :math:`1 - \max_q \bar p_q`.
+
+    Lewis and Gale, *A sequential algorithm for training text classifiers*, 1994; Culotta and
+    McCallum, *Reducing labeling effort for structured prediction tasks*, 2005.
+
+    Args:
+        predicted: of the answers to C candidates, under M samples.
+        samples: (… M D), the belief samples; not needed here.
+
+    Returns:
+        (… C), between 0 and 1 - 1/R. As volume removal, it is not 0 where options are alike, and
+        even greatest there.
+    """
+    return 1 - predicted.probs.mean(-2).amax(-1)
 
 
 def alignment_gain(predicted: Prediction, samples: Tensor) -> Tensor:

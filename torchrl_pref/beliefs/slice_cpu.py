@@ -227,8 +227,7 @@ def _search(
     n = circles.shape[2]
     turn, angle, cosine, sine = np.zeros(n), np.empty(n), np.ones(n), np.zeros(n)
     lapses = np.any(floors > 0)
-    if lapses:
-        odds = odds.copy()
+    odds = odds.copy() if lapses else odds
     level = _surprise(circles, raised, ends, floors, odds, cosine, sine, hard, tolerance)
     for m in range(n):
         level[m] = power * level[m] - meridians * _log(abs(pole[1, m]))
@@ -255,9 +254,8 @@ def _search(
                 n += 1
         if n == 0:
             break
-        if lapses:
-            for j in range(n):
-                odds[j] = odds[refused[j]]
+        for j in range(n if lapses else 0):
+            odds[j] = odds[refused[j]]
         for g in range(len(raised)):
             for j in range(n):
                 circles[0, g, j] = circles[0, g, refused[j]]

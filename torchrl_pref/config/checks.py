@@ -27,6 +27,22 @@ EXTRAS = ("wandb", "mlflow")
 """Loggers whose packages are extras, of the same names."""
 
 
+STRATEGIES = (
+    "alignment_gain",
+    "information_gain",
+    "volume_removal",
+    "max_regret",
+    "disagreement",
+    "thompson",
+    "least_confidence",
+    "knowledge_gradient",
+)
+"""Those that either setup knows by name, beside ``random`` (docs/strategies.md)."""
+
+ONLY_QUERY = "lookahead"
+"""What looks ahead in a pool of questions, and has none in a feed."""
+
+
 def check_tau(name: str, value: Any) -> None:
     """Refuse what is no kind of human.
 
@@ -121,17 +137,23 @@ def check_loggers(name: str, value: Any) -> None:
             )
 
 
-def check_strategy(name: str, value: Any) -> None:
-    """Refuse what is no name of a strategy of the user.
+def strategy(*known: str) -> Check:
+    """What refuses all but strategies of the package, by name, and ``module:name`` of the user's.
 
-    Raises:
-        InputError: it is not ``module:name``.
+    Args:
+        known: the names.
     """
-    if not isinstance(value, str) or not re.fullmatch(r"[^\W\d][\w.]*:[^\W\d]\w*", value):
-        raise InputError(
-            f"{name}={value!r}: expected <module>:<name>, as in {name}=mine:Rule for what Rule of "
-            "mine.py makes of the environment"
-        )
+
+    def check(name: str, value: Any) -> None:
+        if value not in known and not (
+            isinstance(value, str) and re.fullmatch(r"[^\W\d][\w.]*:[^\W\d]\w*", value)
+        ):
+            raise InputError(
+                f"{name}={value!s:.80}: expected one of {', '.join(known)}, or <module>:<name> of "
+                f"yours, as in {name}=mine:Rule for what Rule of mine.py makes of the environment"
+            )
+
+    return check
 
 
 def optional(check: Check) -> Check:

@@ -16,18 +16,20 @@ from typing import Any, cast
 from torchrl_pref.config.checks import (
     LARGEST_TAU,
     LARGEST_THREADS,
+    ONLY_QUERY,
+    STRATEGIES,
     Check,
     check_device,
     check_loggers,
     check_path,
     check_spread,
-    check_strategy,
     check_tau,
     choice,
     count,
     one_or_more,
     optional,
     positive,
+    strategy,
 )
 from torchrl_pref.config.memory import check_memory
 from torchrl_pref.config.sections import Plain, Settings
@@ -93,7 +95,7 @@ EVALUATE: dict[str, Check] = {
     "protocol": optional(choice("heldout")),
     "workers": count(1, LARGEST_THREADS),
     "checkpoint": optional(one_or_more(check_path)),
-    "strategy": optional(one_or_more(check_strategy)),
+    "strategy": optional(one_or_more(strategy(*STRATEGIES, ONLY_QUERY))),
 }
 """Of evaluate.py."""
 

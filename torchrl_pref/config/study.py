@@ -7,14 +7,16 @@ from typing import Any
 
 from torchrl_pref.config.checks import (
     LARGEST_THREADS,
+    ONLY_QUERY,
+    STRATEGIES,
     Check,
     check_path,
-    check_strategy,
     check_tau,
     choice,
     count,
     one_or_more,
     optional,
+    strategy,
 )
 from torchrl_pref.config.sections import Plain
 from torchrl_pref.config.settings import OTHERS, check_keys
@@ -30,9 +32,6 @@ from torchrl_pref.errors import (
 
 CODE = re.compile(r"[A-Za-z0-9_-]{1,32}")
 """What a participant can be called."""
-
-STRATEGIES = ("policy", "alignment_gain", "information_gain", "volume_removal", "random")
-OF_QUERY = (*STRATEGIES, "lookahead")
 
 MOST_QUESTIONS = 1000
 """Nobody answers more in one study."""
@@ -68,18 +67,6 @@ def _check_host(name: str, value: Any) -> None:
         )
 
 
-def _check_asks(name: str, value: Any) -> None:
-    """Refuse what names no strategy."""
-    if value not in OF_QUERY:
-        if isinstance(value, str) and ":" in value:
-            check_strategy(name, value)
-        else:
-            raise InputError(
-                f"{name}={value!s:.80}: expected one of {', '.join(OF_QUERY)}, or <module>:<name> "
-                "of yours"
-            )
-
-
 KEYS: dict[str, Check] = {
     "resume": optional(check_path),
     "export": optional(check_path),
@@ -88,7 +75,7 @@ KEYS: dict[str, Check] = {
     "host": _check_host,
     "port": count(0, 65535),
     "open": check_flag,
-    "strategy": _check_asks,
+    "strategy": strategy("policy", *STRATEGIES, "random", ONLY_QUERY),
     "tau": check_tau,
     "seed": check_seed,
     "threads": count(1, LARGEST_THREADS),
@@ -154,9 +141,9 @@ def check_ask_settings(settings: Plain) -> Plain:
                 "questions as stream by, as nobody is asked one twice; raise it, or lower "
                 "setup.offers"
             )
-        if asks == "lookahead":
+        if asks == ONLY_QUERY:
             raise InputError(
-                "strategy=lookahead with setup=feed: it looks ahead in a pool of questions; type "
+                f"strategy={asks} with setup=feed: it looks ahead in a pool of questions; type "
                 "setup=query, or another strategy"
             )
     elif pool["file"] is None and pool["size"] < setup["budget"]:

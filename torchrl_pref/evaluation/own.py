@@ -1,9 +1,10 @@
-"""Strategies of the user, named as ``module:name``, to be judged beside ours.
+"""Strategies that the user names, to be judged beside the baselines: ``max_regret``, ``mine:rule``.
 
-``name`` is called with the environment, a :class:`QueryEnv` or a :class:`FeedEnv`, and gives a
-TensorDictModule that writes ``action``: for each session the number of a candidate (with
-``setup.batch=n`` the numbers of n), or 0 to skip and 1 to ask. Where it is a probabilistic actor
-its most likely action is taken.
+A name alone is one of the package's (``strategies.STRATEGIES``, in a feed ``FEED_STRATEGIES``). Of
+others, named as ``module:name``, ``name`` is called with the environment, a :class:`QueryEnv` or a
+:class:`FeedEnv`, and gives a TensorDictModule that writes ``action``: for each session the number
+of a candidate (with ``setup.batch=n`` the numbers of n), or 0 to skip and 1 to ask. Where it is a
+probabilistic actor its most likely action is taken.
 
 Only what the user typed is imported: names come from the command line and never from a file.
 """
@@ -11,6 +12,7 @@ Only what the user typed is imported: names come from the command line and never
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import torch
 from tensordict import TensorDictBase
@@ -22,23 +24,27 @@ from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.errors import InputError
 from torchrl_pref.evaluation.side_by_side import Entrant
 from torchrl_pref.groups import load, where
+from torchrl_pref.strategies import make_strategy
 
 Maker = Callable[[QueryEnv | FeedEnv], TensorDictModuleBase]
 
 
 def find_makers(typed: Sequence[str]) -> dict[str, Maker]:
-    """Import what makes each strategy; the current directory is looked in last.
+    """What makes each strategy; for the user's own the current directory is looked in last.
 
     Args:
-        typed: ``module:name`` of each.
+        typed: a name of the package, or ``module:name``, of each.
 
     Returns:
-        What was imported, by the same names.
+        What was found or imported, by the same names.
 
     Raises:
         InputError: there is no such module or name, or it cannot be called.
     """
-    return {name: load(f"strategy={name}", name) for name in typed}
+    return {
+        name: load(f"strategy={name}", name) if ":" in name else partial(make_strategy, name)
+        for name in typed
+    }
 
 
 def make_own(makers: Mapping[str, Maker], env: QueryEnv | FeedEnv, seed: int) -> list[Entrant]:
@@ -53,6 +59,8 @@ def make_own(makers: Mapping[str, Maker], env: QueryEnv | FeedEnv, seed: int) ->
         try:
             strategy = maker(env)
         except Exception as error:
+            if ":" not in typed:  # one of ours, which says so itself
+                raise
             raise InputError(
                 f"strategy={typed}: making it for a {type(env).__name__} fails ({where(error)}); "
                 "expected a function of the environment, or a class made with it"

@@ -11,6 +11,7 @@ from abc import ABC, abstractmethod
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from torchrl_pref.questions.base import (
@@ -32,6 +33,15 @@ class Prediction(NamedTuple):
     """(… M R), probability of each answer under each sample."""
     entropy: Tensor
     """(…), entropy of the answer in nats, averaged over the samples."""
+    leads: Tensor
+    """(… M K-1), by how much the return of each option exceeds that of the last one, under each
+    sample; of a single option (… M 1), its return."""
+
+    @property
+    def returns(self) -> Tensor:
+        """(… M K) under each sample, the last option's set to 0; a single option has beside it what
+        would have a return of 0, (… M 2)."""
+        return F.pad(self.leads, (0, 1))
 
 
 class ResponseModel(ABC):
@@ -191,7 +201,8 @@ class ResponseModel(ABC):
         probs = log_probs.exp()
         # The clamp keeps 0 · log 0 from being NaN; it changes no product that float32 can hold.
         entropy = -(probs * log_probs.clamp(min=-1e4)).mean(-2).sum(-1)
-        return Prediction(probs, entropy)
+        leads = returns[..., :-1] - returns[..., -1:] if returns.shape[-1] > 1 else returns
+        return Prediction(probs, entropy, leads)
 
     def tables(self, n_options: int, device: torch.device) -> tuple[Factors, Tensor]:
         """The factors of the answers to a query of K options, and their log-weights (R)."""

@@ -98,7 +98,7 @@ class Boltzmann(ResponseModel):
         probs = torch.stack([first, second]).movedim(0, -1)
         unlikely, likely = torch.minimum(first, second), torch.maximum(first, second)
         entropy = logit.abs_().mul_(unlikely).mean(-1) - sum_of_logs(likely) / logit.shape[-1]
-        return Prediction(probs, entropy)
+        return Prediction(probs, entropy, leads)
 
     def __repr__(self) -> str:
         return f"Boltzmann(tau={shown(self.tau)}{_beside(self)})"
@@ -168,7 +168,8 @@ class Optimal(ResponseModel):
             return super().predict(leads)
         winner = F.hardshrink(leads.squeeze(-1), self.tolerance).sign()  # 1, -1, or 0 for a tie
         entropy = math.log(2) * (1 - winner.abs().mean(-1))
-        return Prediction(torch.stack([winner + 1, 1 - winner]).movedim(0, -1) / 2, entropy)
+        probs = torch.stack([winner + 1, 1 - winner]).movedim(0, -1) / 2
+        return Prediction(probs, entropy, leads)
 
     def __repr__(self) -> str:
         tolerance = "" if self.tolerance == TOLERANCE else f", tolerance={shown(self.tolerance)}"

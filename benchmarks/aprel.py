@@ -149,8 +149,9 @@ def tutorial_by_aprel(aprel: ModuleType, features: Tensor, omega: Tensor, luck: 
 
 
 def main() -> None:
-    """Print both tables."""
+    """Print a table."""
     parser = common.arguments(__doc__)
+    parser.add_argument("what", choices=["posterior", "tutorial"], help="which table")
     parser.add_argument("--made", type=int, default=8, help="beliefs of APReL's (default 8)")
     parser.add_argument("--people", type=int, default=5, help="in the tutorial (default 5)")
     typed = common.start(parser)
@@ -159,16 +160,13 @@ def main() -> None:
         parser.error(
             'APReL is not there; pip install gym "moviepy<2" scipy, and put its clone on PYTHONPATH'
         )
-    common.report(
-        "The same answers (three options, tau = 2, D = 4), 100 samples",
-        posterior(aprel, typed.made),
-        typed.json,
-    )
-    common.report(
-        "APReL's tutorial: 10 trajectories of MountainCar, 10 questions",
-        tutorial(aprel, typed.people),
-        None,
-    )
+    if typed.what == "posterior":
+        title = "The same answers, of three options, tau = 2, D = 4, 100 samples"
+        rows = posterior(aprel, typed.made)
+    else:
+        title = f"{TRAJECTORIES} trajectories of MountainCar, {QUESTIONS} questions"
+        rows = tutorial(aprel, typed.people)
+    common.report(title, rows, typed.json)
 
 
 if __name__ == "__main__":

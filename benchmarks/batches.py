@@ -29,13 +29,12 @@ from torch import Tensor
 from tqdm import tqdm
 
 from benchmarks import common
-from torchrl_pref.batches import BATCH_STRATEGIES
 from torchrl_pref.build import make_pools, make_query_env, make_task
 from torchrl_pref.evaluation.comparison import FIRST_EVALUATION_SEED
 from torchrl_pref.evaluation.run import draw_humans, evaluate
 from torchrl_pref.evaluation.statistics import bootstrap_interval
 from torchrl_pref.problem import Problem
-from torchrl_pref.strategies import Greedy
+from torchrl_pref.strategies import BATCH_STRATEGIES, Greedy
 
 ONE_BY_ONE = "one at a time"
 

@@ -87,6 +87,11 @@ def benchmark(name: str) -> Callable[[Path], dict[str, str]]:
     return write
 
 
+def beside_aprel(folder: Path) -> dict[str, str]:
+    """The tables of ours beside APReL."""
+    return benchmark("aprel")(folder) | benchmark("aprel_tutorial")(folder)
+
+
 def cell(value: Any) -> str:
     """Three digits of a number, and all of a whole one."""
     if isinstance(value, float):
@@ -361,6 +366,18 @@ PARTS: dict[str, Part] = {
         ("python benchmarks/page.py --pictures {folder}/page -> page/error-phone.png",),
         2,
         pictures,
+    ),
+    "room": measured("room", "docs/strategies.md", 40),
+    "large_pool": measured("large_pool", "docs/speed.md", 1),
+    "aprel": Part(
+        "docs/aprel.md",
+        (
+            "python benchmarks/aprel.py posterior --json {folder}/aprel.json -> aprel.json",
+            "python benchmarks/aprel.py tutorial --json {folder}/aprel_tutorial.json "
+            "-> aprel_tutorial.json",
+        ),
+        5,
+        beside_aprel,
     ),
     "dimension": measured("dimension", "docs/robustness.md", 30, "--features 8,16,32"),
 }

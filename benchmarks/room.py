@@ -34,13 +34,12 @@ from torchrl_pref.beliefs.sampled import Belief, uniform_sphere
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.evaluation.run import draw_humans, evaluate
 from torchrl_pref.humans.simulated import SimulatedHuman
-from torchrl_pref.lookahead import AlignmentLookahead
 from torchrl_pref.pool import Normalizer, QueryPool
 from torchrl_pref.questions import QUESTIONS
 from torchrl_pref.questions.calibrate import calibrate_tau
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.questions.responses import model_of
-from torchrl_pref.strategies import Greedy
+from torchrl_pref.strategies import AlignmentLookahead, Greedy
 from torchrl_pref.tasks.base import make_pool
 from torchrl_pref.tasks.gaussian import GaussianTask
 

@@ -57,7 +57,7 @@ def test_answers_that_are_certain_carry_no_information(samples: Tensor) -> None:
 def test_about_equal_can_be_answered() -> None:
     features = torch.randn(20, 2, 3, generator=Generator().manual_seed(1))
     session = Session(features, Boltzmann(2.0, Weak(0.5)))
-    assert session.answers == ("first", "second", "about equal")
+    assert session.answers == ("the first", "the second", "about equal")
     session.ask()
     session.tell(2)
     assert session.n_answered == 1

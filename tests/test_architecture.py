@@ -21,7 +21,6 @@ ORDER = [
     "humans",
     "envs",
     "strategies",
-    "batches",
     "policies",
     "runs",
     "groups",

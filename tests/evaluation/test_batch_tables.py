@@ -8,14 +8,13 @@ import pytest
 from helpers import settings_of
 from tensordict.nn import TensorDictModule
 
-from torchrl_pref.batches import BATCH_STRATEGIES
 from torchrl_pref.build import make_pools, make_task
 from torchrl_pref.errors import InputError
 from torchrl_pref.evaluation.comparison import evaluate_task, try_strategies
 from torchrl_pref.evaluation.records import Records
 from torchrl_pref.evaluation.style import KINDS
 from torchrl_pref.evaluation.tables import tables
-from torchrl_pref.strategies import RandomQuery
+from torchrl_pref.strategies import BATCH_STRATEGIES, RandomQuery
 
 
 def evaluated(batch: int, options: int = 2, own: dict[str, Any] | None = None) -> Records:

@@ -39,7 +39,7 @@ STRATEGIES = (
 )
 """Those that either setup knows by name, beside ``random`` (docs/strategies.md)."""
 
-ONLY_QUERY = "lookahead"
+ONLY_QUERY = ("lookahead", "alignment_lookahead")
 """What looks ahead in a pool of questions, and has none in a feed."""
 
 

@@ -95,7 +95,7 @@ EVALUATE: dict[str, Check] = {
     "protocol": optional(choice("heldout")),
     "workers": count(1, LARGEST_THREADS),
     "checkpoint": optional(one_or_more(check_path)),
-    "strategy": optional(one_or_more(strategy(*STRATEGIES, ONLY_QUERY))),
+    "strategy": optional(one_or_more(strategy(*STRATEGIES, *ONLY_QUERY))),
 }
 """Of evaluate.py."""
 

@@ -75,7 +75,7 @@ KEYS: dict[str, Check] = {
     "host": _check_host,
     "port": count(0, 65535),
     "open": check_flag,
-    "strategy": strategy("policy", *STRATEGIES, "random", ONLY_QUERY),
+    "strategy": strategy("policy", *STRATEGIES, "random", *ONLY_QUERY),
     "tau": check_tau,
     "seed": check_seed,
     "threads": count(1, LARGEST_THREADS),
@@ -141,7 +141,7 @@ def check_ask_settings(settings: Plain) -> Plain:
                 "questions as stream by, as nobody is asked one twice; raise it, or lower "
                 "setup.offers"
             )
-        if asks == ONLY_QUERY:
+        if asks in ONLY_QUERY:
             raise InputError(
                 f"strategy={asks} with setup=feed: it looks ahead in a pool of questions; type "
                 "setup=query, or another strategy"

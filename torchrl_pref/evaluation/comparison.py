@@ -11,7 +11,6 @@ from tqdm import tqdm
 
 from torchrl_pref.acquisition.batch import BATCHES, OF_PAIRS
 from torchrl_pref.acquisition.functions import alignment_gain
-from torchrl_pref.batches import BATCH_STRATEGIES
 from torchrl_pref.build import load_policy, make_feed_env, make_query_env
 from torchrl_pref.checkpoints.checkpoint import Checkpoint
 from torchrl_pref.config.memory import check_memory
@@ -26,7 +25,7 @@ from torchrl_pref.evaluation.side_by_side import Entrant
 from torchrl_pref.policies.base import Policy
 from torchrl_pref.pool import QueryPool
 from torchrl_pref.problem import Problem
-from torchrl_pref.strategies import Greedy, QuantileAsk, RandomAsk, RandomQuery
+from torchrl_pref.strategies import BATCH_STRATEGIES, Greedy, QuantileAsk, RandomAsk, RandomQuery
 
 FIRST_EVALUATION_SEED = 2**31
 """Evaluation seeds lie where no training seed does: the humans of the one are not the other's."""

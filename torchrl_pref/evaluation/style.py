@@ -65,11 +65,11 @@ KINDS: dict[str, Kind] = {
         Style("boundary medoids", "#e69f00", "-"), batch=True, baseline="batch_top"
     ),
     "batch_successive_elimination": Kind(
-        Style("successive elimination", "#0072b2", "-"), batch=True, baseline="batch_top"
+        Style("successive elimination", "#0072b2", "-."), batch=True, baseline="batch_top"
     ),
     "batch_dpp": Kind(Style("DPP", "#cc79a7", "-"), batch=True, baseline="batch_top"),
     "batch_joint": Kind(
-        Style("joint information", "#009e73", "-"), batch=True, baseline="batch_top"
+        Style("joint information", "#009e73", "-."), batch=True, baseline="batch_top"
     ),
     "ask_all": Kind(Style("ask all", "#000000", ":"), feed=True),
     "threshold": Kind(Style("threshold in bits", "#e69f00", "-."), feed=True, baseline="ask_all"),

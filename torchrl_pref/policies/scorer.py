@@ -34,7 +34,7 @@ from torchrl_pref.policies.base import (
     compared,
 )
 from torchrl_pref.questions.response_model import ResponseModel
-from torchrl_pref.strategies import OfferRank, asks_over_offers
+from torchrl_pref.strategies.feed import OfferRank, asks_over_offers
 from torchrl_pref.tensors import directions
 
 N_CANDIDATE = 7

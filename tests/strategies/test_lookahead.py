@@ -12,9 +12,9 @@ from torchrl_pref.acquisition.functions import alignment_gain
 from torchrl_pref.acquisition.scoring import predict_answers, score_queries
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.errors import InputError
-from torchrl_pref.lookahead import AlignmentLookahead
 from torchrl_pref.pool import QueryPool
 from torchrl_pref.questions.response_model import ResponseModel
+from torchrl_pref.strategies import AlignmentLookahead
 
 
 def best(weights: Tensor, probs: Tensor, units: Tensor, steps: int) -> Tensor:

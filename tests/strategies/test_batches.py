@@ -11,10 +11,9 @@ from torch import Generator
 from torchrl_pref.acquisition.batch import BATCHES, OF_PAIRS, Shortlist, joint, top
 from torchrl_pref.acquisition.functions import alignment_gain, information_gain
 from torchrl_pref.acquisition.scoring import predict_answers, score_queries
-from torchrl_pref.batches import BATCH_STRATEGIES, BatchOf
 from torchrl_pref.pool import QueryPool
 from torchrl_pref.questions.response_model import ResponseModel
-from torchrl_pref.strategies import Greedy
+from torchrl_pref.strategies import BATCH_STRATEGIES, BatchOf, Greedy
 from torchrl_pref.tasks.gridworld import gridworld_pool
 
 MODEL = RESPONSE_MODELS[0]

@@ -7,19 +7,16 @@ query, D features, n questions asked at once.
 from __future__ import annotations
 
 import math
-from functools import partial
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import EnvBase
 
-from torchrl_pref.acquisition.batch import BATCHES, Select, Shortlist, joint
+from torchrl_pref.acquisition.batch import Select, Shortlist, joint
 from torchrl_pref.acquisition.functions import Acquisition, information_gain
 from torchrl_pref.acquisition.scoring import predict_answers, score_queries
 from torchrl_pref.errors import check_count
 from torchrl_pref.questions.response_model import ResponseModel
-from torchrl_pref.strategies import MakeStrategy, RandomQuery
 
 
 class BatchOf(TensorDictModuleBase):
@@ -72,15 +69,3 @@ class BatchOf(TensorDictModuleBase):
             )
             actions.append(best[chosen])
         return tensordict.set("action", torch.stack(actions))
-
-
-def _batch_of(env: EnvBase, select: Select) -> TensorDictModuleBase:
-    """What asks batches in an environment."""
-    return BatchOf(env.belief.response_model, env.batch, select)
-
-
-BATCH_STRATEGIES: dict[str, MakeStrategy] = {
-    "random": lambda env: RandomQuery(batch=env.batch),
-    **{name: partial(_batch_of, select=each) for name, each in BATCHES.items()},
-}
-"""Strategies that choose n candidates of an environment with ``batch=n``, by name."""

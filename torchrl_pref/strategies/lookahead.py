@@ -1,4 +1,4 @@
-"""Looking several questions ahead at the alignment that is expected after them.
+"""Strategies that look at the questions after the next, too.
 
 Shapes: G beliefs that are looked at, B sessions, C candidates, M belief samples, R possible
 answers, D features.
@@ -13,6 +13,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from torchrl_pref.acquisition.functions import information_gain
 from torchrl_pref.acquisition.scoring import predict_answers
 from torchrl_pref.envs.transition import OPEN
 from torchrl_pref.errors import check_count
@@ -21,6 +22,52 @@ from torchrl_pref.tensors import directions
 
 HELD = 4_000_000
 """Numbers (G D+1 C R) held at once: bounds memory."""
+
+
+class Lookahead(TensorDictModuleBase):
+    """Ask the candidate whose information gain and best successor's sum to most: two steps ahead.
+
+    The belief after each answer to the first query is the present one reweighted, so that all
+    second steps are matrix products. Only the ``beam`` best first steps are followed.
+
+    Args:
+        response_model: how the belief thinks the human answers.
+        beam: first steps to follow.
+    """
+
+    in_keys = ["samples", "queries", "action_mask", ("session", "history", "answers")]
+    out_keys = ["action"]
+
+    def __init__(self, response_model: ResponseModel, beam: int = 20) -> None:
+        super().__init__()
+        self.response_model = response_model
+        self.beam = check_count("beam", beam, 1)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action`` (B)."""
+        # One session at a time: the table of all second steps is large.
+        actions = [self._choose(session) for session in tensordict.select(*self.in_keys).unbind(0)]
+        return tensordict.set("action", torch.stack(actions))
+
+    def _choose(self, session: TensorDictBase) -> Tensor:
+        samples = session["samples"].unsqueeze(0)
+        predicted = predict_answers(samples, session["queries"].unsqueeze(0), self.response_model)
+        gain = information_gain(predicted, samples)[0]
+        gain = gain.masked_fill(~session["action_mask"], -math.inf)
+        probs = predicted.probs[0]  # (C M R)
+        entropy = torch.special.entr(probs).sum(-1)
+        value, first = gain.topk(min(self.beam, len(gain)))
+        n_open = (session["session", "history", "answers"] == OPEN).sum()
+        if n_open <= 1:  # no second step after the last
+            return first[0]
+        joint = probs[first].mT / probs.shape[1]  # (beam R M): P(answer and sample)
+        of_answer = joint.sum(-1, keepdim=True)
+        weights = joint / of_answer.clamp(min=1e-30)
+        later = torch.stack([weights @ answer.T for answer in probs.unbind(-1)])
+        # (beam R C), information gain of every second query after every first answer
+        second = torch.special.entr(later).sum(0) - weights @ entropy.T
+        best = second.masked_fill(~session["action_mask"], 0.0).amax(-1) / math.log(2)
+        return first[(value + (of_answer.squeeze(-1) * best).sum(-1)).argmax()]
 
 
 class AlignmentLookahead(TensorDictModuleBase):

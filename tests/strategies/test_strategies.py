@@ -16,7 +16,6 @@ from torchrl_pref.errors import InputError
 from torchrl_pref.pool import QueryPool
 from torchrl_pref.questions.response_model import Prediction, ResponseModel
 from torchrl_pref.strategies import (
-    REFERENCE,
     Greedy,
     Lookahead,
     OfferRank,
@@ -25,6 +24,7 @@ from torchrl_pref.strategies import (
     RandomQuery,
     ThresholdAsk,
 )
+from torchrl_pref.strategies.feed import REFERENCE
 
 
 def test_random_strategies_have_their_own_seeded_luck(pool: QueryPool) -> None:

@@ -28,6 +28,7 @@ from torchrl_pref.policies import attention
 from torchrl_pref.questions import QUESTIONS
 from torchrl_pref.questions.prior_evidence import evidence_of, joined
 from torchrl_pref.questions.responses import Boltzmann
+from torchrl_pref.strategies import FEED_STRATEGIES, STRATEGIES
 from torchrl_pref.training.algorithms import ALGORITHMS
 from torchrl_pref.training.loggers import LOGGERS
 
@@ -294,3 +295,15 @@ def test_the_estimate_knows_how_many_answers_there_are() -> None:
             table = kind().answers(n_options)
             expected = len(table.labels), *table.offsets.shape[1:]
             assert memory.sizes_of({"question": {"name": name}}, n_options) == expected
+
+
+def test_the_names_of_strategies_are_those_of_the_tables() -> None:
+    both = {"random", *checks.STRATEGIES}
+    assert set(FEED_STRATEGIES) == both
+    assert set(STRATEGIES) == both | {checks.ONLY_QUERY}
+    page = (ROOT / "docs" / "strategies.md").read_text()
+    for script in ("ask", "evaluate"):
+        help_text = (ROOT / "conf" / f"{script}.yaml").read_text()
+        for name in (*checks.STRATEGIES, checks.ONLY_QUERY):
+            assert name in help_text
+            assert f"| `{name}` |" in page

@@ -8,6 +8,8 @@ from helpers import make, session_of
 from torch import Generator, Tensor
 
 from torchrl_pref.acquisition.functions import alignment_gain, information_gain
+from torchrl_pref.acquisition.knowledge_gradient import KnowledgeGradient
+from torchrl_pref.acquisition.pairs import max_regret
 from torchrl_pref.acquisition.scoring import predict_answers, score_queries
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.objectives import make_objective
@@ -16,13 +18,17 @@ from torchrl_pref.errors import InputError
 from torchrl_pref.pool import QueryPool
 from torchrl_pref.questions.response_model import Prediction, ResponseModel
 from torchrl_pref.strategies import (
+    FEED_STRATEGIES,
+    STRATEGIES,
     Greedy,
     Lookahead,
     OfferRank,
     QuantileAsk,
     RandomAsk,
     RandomQuery,
+    Thompson,
     ThresholdAsk,
+    make_strategy,
 )
 from torchrl_pref.strategies.feed import REFERENCE
 
@@ -211,3 +217,46 @@ def test_quantile_rule_uses_up_its_asks_on_the_best(acquisition: object, pool: Q
     assert torch.equal(first["action"] == 1, rank.squeeze(-1) >= 1 - 5 / 25)
     asked = data["next", "n_asked"].squeeze(-1).amax(1)
     assert (asked == 5).all()
+
+
+def test_thompson_asks_what_two_drawn_samples_have_most_at_stake_about(pool: QueryPool) -> None:
+    env = make(QueryEnv, pool, batch=30)
+    session, model = session_of(env), env.belief.response_model
+    chosen = Thompson(Greedy(model, max_regret), seed=3)(session.clone())
+    assert torch.equal(chosen["samples"], session["samples"])
+    assert torch.equal(
+        chosen["action"], Thompson(Greedy(model, max_regret), seed=3)(session.clone())["action"]
+    )
+    asked = []
+    for b in range(30):
+        omegas = session["samples"][b].double()
+        returns = session["queries"][b].double() @ omegas.T  # (C K M)
+        stakes = set()
+        for i in range(len(omegas)):
+            for j in range(i):
+                one, other = returns[..., i], returns[..., j]
+                first, second = one.argmax(-1, keepdim=True), other.argmax(-1, keepdim=True)
+                lost = one.gather(-1, first) - one.gather(-1, second)
+                lost = lost + other.gather(-1, second) - other.gather(-1, first)
+                stakes.add(int(lost.squeeze(-1).argmax()))
+        assert int(chosen["action"][b]) in stakes
+        asked.append(int(chosen["action"][b]))
+    assert len(set(asked)) > 5
+
+
+@pytest.mark.parametrize("name", ["thompson", "knowledge_gradient", "max_regret"])
+def test_later_strategies_decide_in_both_setups(name: str, pool: QueryPool) -> None:
+    for kind, table in ((QueryEnv, STRATEGIES), (FeedEnv, FEED_STRATEGIES)):
+        env = make(kind, pool, batch=6)
+        data = env.rollout(5, table[name](env))
+        assert data["action"].unique().numel() > 1
+        assert (data["action"] < (2 if kind is FeedEnv else len(pool))).all()
+
+
+def test_knowledge_gradient_is_of_the_pool_that_is_asked_about(pool: QueryPool) -> None:
+    env = make(QueryEnv, pool)
+    acquisition = STRATEGIES["knowledge_gradient"](env).acquisition
+    assert isinstance(acquisition, KnowledgeGradient)
+    assert torch.equal(acquisition.trajectories, pool.features.flatten(0, 1).unique(dim=0))
+    with pytest.raises(InputError, match="strategy='lookahead': expected one of random"):
+        make_strategy("lookahead", make(FeedEnv, pool))

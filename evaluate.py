@@ -40,6 +40,7 @@ PROTOCOL_KEYS = (
     "setup.budget",
     "setup.offers",
     "strategy",
+    "evaluation.metrics",
     "belief.",
     "task",
     "task.",

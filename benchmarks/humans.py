@@ -5,7 +5,8 @@ by greedy information gain and greedy expected alignment, with a belief that kno
 imperfection and with one that allows for an answer at random in 20. The first row is what the
 others are held against: the human whom the belief expects. The humans of all rows have the same ω.
 Alignment is the mean over the samples of their cosine with ω, beside it stands the cosine of their
-mean, and ± is twice the standard error of the latter.
+mean, ± is twice the standard error of the latter, and the last number is the calibration error of
+the answers that the beliefs predict to questions that nobody asks.
 """
 
 from __future__ import annotations
@@ -63,7 +64,8 @@ def main() -> None:
                 row[words + beside] = _reached(results[key])
         rows.append(row)
     title = (
-        f"Alignment / cosine of the mean after 20 questions, {options.humans} humans of each kind"
+        f"Alignment / cosine of the mean / calibration error after 20 questions, {options.humans} "
+        "humans of each kind"
     )
     common.report(title, rows, options.json)
 
@@ -81,10 +83,12 @@ def settings_of(*typed: str | int) -> dict[str, Any]:
 
 
 def _reached(result: Evaluation) -> str:
-    """The mean alignment, the cosine of the mean, and twice its standard error."""
+    """The mean alignment, the cosine of the mean with twice its standard error, and calibration."""
     cosines = result.alignment_of_mean[:, -1]
     error = 2 * cosines.std() / len(cosines) ** 0.5
-    return f"{result.alignment[:, -1].mean():.3f} / {cosines.mean():.3f} ± {error:.3f}"
+    wrong = result.metrics["calibration"][:, -1].mean()
+    aligned = result.alignment[:, -1].mean()
+    return f"{aligned:.3f} / {cosines.mean():.3f} ± {error:.3f} / {wrong:.3f}"
 
 
 if __name__ == "__main__":

@@ -4,7 +4,8 @@
 times a factor, and they answer 20 greedy questions of each of three beliefs: one that infers tau,
 one that is told the reference, and one that is told the human's own. All face the same humans and
 the same luck. *Coverage* is how often the human's return of a random trajectory lies in the central
-interval that the belief holds for so likely, over the humans of all factors.
+interval that the belief holds for so likely, over the humans of all factors; beside it stands the
+calibration error of the answers that beliefs predict to random questions.
 """
 
 from __future__ import annotations
@@ -28,6 +29,13 @@ from torchrl_pref.beliefs.rationality import RationalityBelief
 from torchrl_pref.beliefs.sampled import Belief
 from torchrl_pref.envs.objectives import alignment_of_mean
 from torchrl_pref.envs.query import QueryEnv
+from torchrl_pref.evaluation.metrics import (
+    QUESTIONS,
+    Exam,
+    Standing,
+    calibration,
+    reliability,
+)
 from torchrl_pref.humans.simulated import SimulatedHuman
 from torchrl_pref.pool import Normalizer, QueryPool
 from torchrl_pref.questions.responses import Boltzmann
@@ -55,6 +63,7 @@ def main() -> None:
     covered: list[common.Row] = []
     for (name, pool), how in product(pools.items(), ("alignment_gain", "information_gain")):
         inside: dict[str, list[Tensor]] = {}
+        foreseen: dict[str, list[Tensor]] = {}
         for factor in FACTORS:
             row: common.Row = {"pool": name, "greedy by": how, "factor": factor}
             found = {}
@@ -62,7 +71,9 @@ def main() -> None:
                 samples, omega = asked(pool, belief, how, factor, options.humans, options.seed)
                 found[kind] = alignment_of_mean(samples, omega).squeeze(-1)
                 row[kind] = float(found[kind][:, -1].mean())
-                inside.setdefault(kind, []).append(coverage(samples[:, -1], omega[:, -1]))
+                last = samples[:, -1], omega[:, -1]
+                inside.setdefault(kind, []).append(coverage(*last))
+                foreseen.setdefault(kind, []).append(predicted(*last, belief, factor))
             for other in ("told wrongly", "told rightly"):
                 gain = (found["inferred"] - found[other])[:, -1]
                 row[f"less {other}"] = float(gain.mean())
@@ -71,10 +82,12 @@ def main() -> None:
         for kind, each in inside.items():
             shares = torch.stack(each).mean(0).tolist()
             levels = dict(zip(map("{:.0%}".format, LEVELS), shares, strict=True))
-            covered.append({"pool": name, "greedy by": how, "belief": kind, **levels})
+            error = float(calibration(torch.cat(foreseen[kind])).mean())
+            of = {"pool": name, "greedy by": how, "belief": kind}
+            covered.append({**of, **levels, "calibration error": error})
     title = f"Cosine of the mean after {BUDGET} answers, {options.humans} humans a row"
     common.report(title, cosines, options.json)
-    common.report("Coverage of central intervals", covered, None)
+    common.report("Coverage of central intervals, and calibration of answers", covered, None)
     if options.plot:
         draw(covered, options.plot)
 
@@ -126,6 +139,16 @@ def coverage(samples: Tensor, omega: Tensor) -> Tensor:
         low, high = torch.quantile(returns, ends, dim=1)
         inside.append(((low < true) & (true < high)).double().mean())
     return torch.stack(inside)
+
+
+def predicted(samples: Tensor, omega: Tensor, belief: BeliefBase, factor: float) -> Tensor:
+    """Answers to random questions by how likely they are to the belief, see ``reliability``."""
+    size = (QUESTIONS, 2, omega.shape[-1])
+    queries = torch.randn(size, generator=Generator().manual_seed(2))
+    returns = torch.einsum("nkd,bd->bnk", queries, omega * factor)
+    answers = Boltzmann(common.TAU)(returns).exp()
+    exam = Exam(queries, queries, queries.flatten(0, 1), ("calibration",))
+    return reliability(Standing(samples, omega, answers, exam, belief.response_model))
 
 
 def draw(covered: list[common.Row], path: Path) -> None:

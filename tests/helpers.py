@@ -72,7 +72,7 @@ def settings_of(setup: str = "feed", policy: str = "scorer", **training: Any) ->
         "belief": {"name": "sampled", "samples": 10, "moves": 1, "lapse": 0.0},
         "logger": ["csv"],
         "algorithm": {"name": "a2c"},
-        "evaluation": {"humans": 5, "seed": 1, "during": 0},
+        "evaluation": {"humans": 5, "seed": 1, "during": 0, "metrics": ["calibration"]},
         "policy": {"name": policy, "sample": False, **OF_POLICY[policy]},
         "setup": {
             "name": setup,

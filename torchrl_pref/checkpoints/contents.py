@@ -46,7 +46,7 @@ SECTIONS: dict[str, dict[str, Types]] = {
     },
     "belief": {"name": TEXT, "lapse": NUMBER},
     "policy": {"name": TEXT, "sample": FLAG},
-    "evaluation": {"humans": WHOLE, "seed": WHOLE, "during": WHOLE},
+    "evaluation": {"humans": WHOLE, "seed": WHOLE, "during": WHOLE, "metrics": (list,)},
     "training": {
         **dict.fromkeys(("updates", "sessions", "critic_steps", "warm_up", "save_every"), WHOLE),
         **dict.fromkeys(("learning_rate", "gamma", "lmbda", "entropy", "critic"), NUMBER),

@@ -31,9 +31,11 @@ def migrate(settings: Any) -> None:
     """
     if not isinstance(settings, dict):
         return
-    # Version 0.1.0 evaluated nothing while it trained; up to format 4 there was A2C alone.
+    # Version 0.1.0 evaluated nothing while it trained, and up to format 6 alignment alone was
+    # measured; up to format 4 there was A2C alone.
     if isinstance(settings.get("evaluation"), dict):
         settings["evaluation"].setdefault("during", 0)
+        settings["evaluation"].setdefault("metrics", [])
     settings.setdefault("algorithm", {"name": "a2c"})
     # Up to format 4 there was one task, one question, one kind of human and one of belief.
     if "grid" in settings:

@@ -176,6 +176,18 @@ def one_or_more(check: Check) -> Check:
     return check_all
 
 
+def none_or_more(check: Check) -> Check:
+    """The check of each in a list of different ones, which may be empty."""
+
+    def check_all(name: str, value: Any) -> None:
+        if not isinstance(value, list):
+            raise InputError(f"{name}={value!r}: expected a list, such as {name}=[{value}]")
+        if value:
+            one_or_more(check)(name, value)
+
+    return check_all
+
+
 def count(minimum: int, maximum: int = LARGEST_COUNT) -> Check:
     """A whole number from a minimum to a maximum."""
 

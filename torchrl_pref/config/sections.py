@@ -44,6 +44,7 @@ class EvaluationSection(TypedDict):
 
     humans: int
     seed: int
+    metrics: list[str]
     during: NotRequired[int]
 
 

@@ -26,6 +26,7 @@ from torchrl_pref.config.checks import (
     check_tau,
     choice,
     count,
+    none_or_more,
     one_or_more,
     optional,
     positive,
@@ -44,6 +45,12 @@ from torchrl_pref.errors import (
 
 OBJECTIVES = ("information_gain", "alignment", "true_alignment", "entropy")
 
+METRICS = (
+    *("alignment", "alignment_of_mean", "accuracy", "log_likelihood", "regret"),
+    *("rank_correlation", "calibration"),
+)
+"""What can be measured of a belief, see ``evaluation.metrics``."""
+
 TASK: dict[str, Check] = {
     "objective": choice(*OBJECTIVES),
     "skip": choice("regret", "free"),
@@ -56,6 +63,7 @@ TASK: dict[str, Check] = {
     "pool.test": optional(check_path),
     "evaluation.humans": count(2),
     "evaluation.seed": check_seed,
+    "evaluation.metrics": none_or_more(choice(*METRICS)),
     "human.tau": optional(check_tau),
     "human.lapse": check_share,
     "belief.lapse": check_share,

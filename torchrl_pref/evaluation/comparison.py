@@ -18,6 +18,7 @@ from torchrl_pref.config.sections import Settings
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.errors import InputError, check_count, check_flag, check_seed
+from torchrl_pref.evaluation.metrics import make_exam
 from torchrl_pref.evaluation.own import Maker, make_own, try_own
 from torchrl_pref.evaluation.records import Records, entry_of
 from torchrl_pref.evaluation.run import CURVES, Evaluation, draw_humans, evaluate
@@ -70,9 +71,9 @@ def evaluate_task(
         for key, result in compare(settings, task, pool, learned, own).items():
             seed = learned[key].settings["seed"] if key in learned else 0
             identity = {"protocol": "comparison", "task": title, "pool": name}
-            records.entries.append(
-                entry_of(result, CURVES, "seconds_per_query", **identity, seed=seed, strategy=key)
-            )
+            identity["strategy"] = key
+            entry = entry_of(result, CURVES, "seconds_per_query", **identity, seed=seed)
+            records.entries.append(entry)
     return records
 
 
@@ -132,11 +133,12 @@ def compare(
         env = _make_env(settings, task, pool, n_humans, seed)
         runs += [(env, entrant) for entrant in make_own(own, env, seed)]
 
+    exam = make_exam(settings, task, pool)
     results = {}
     for env, entrant in tqdm(runs, desc="evaluation", unit="strategy"):
         env.set_seed(seed)
         torch.manual_seed(seed)
-        results[entrant.key] = evaluate(env, entrant.strategy, humans, entrant.sample)
+        results[entrant.key] = evaluate(env, entrant.strategy, humans, entrant.sample, exam)
     return results
 
 

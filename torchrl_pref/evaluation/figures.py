@@ -9,10 +9,12 @@ import math
 from collections.abc import Mapping
 from pathlib import Path
 from textwrap import fill
+from typing import Any
 
 import matplotlib
 from torch import Tensor
 
+from torchrl_pref.evaluation.metrics import METRICS
 from torchrl_pref.evaluation.records import Records
 from torchrl_pref.evaluation.style import (
     Style,
@@ -24,8 +26,8 @@ from torchrl_pref.evaluation.style import (
     name_of,
     styles_of,
 )
-from torchrl_pref.evaluation.tables import title_of
-from torchrl_pref.evaluation.views import alignment, curve, difference
+from torchrl_pref.evaluation.tables import counts, title_of
+from torchrl_pref.evaluation.views import alignment, curve, difference, reliability
 from torchrl_pref.storage.writing import replacing
 
 matplotlib.use("Agg")
@@ -38,9 +40,49 @@ TITLE = 46
 """Letters of a panel's title in a line."""
 
 
-def figure_1(records: Records, path: Path) -> None:
-    """The paper's Figure 1: alignment against the number of queries, a panel for each task."""
-    tasks, styles = records.tasks, styles_of(records.strategies)
+def figure_1(records: Records, path: Path, metric: str = "alignment") -> None:
+    """The paper's Figure 1: alignment, or another metric, against the number of queries, a panel
+    for each task."""
+    styles = styles_of(records.strategies)
+    figure, axes = _panels(records)
+    for axis, task in zip(axes.flat, records.tasks, strict=False):
+        own = records.of_task(task)
+        for key in filter(is_drawn, own.strategies):
+            _draw(axis, key, own.values(key, metric), styles)
+        axis.set(xlabel="queries asked", xlim=(0, None))
+        _finish(axis)
+    for row in axes:
+        row[0].set_ylabel(METRICS[metric].axis)
+    if metric == "alignment":
+        axes[0, 0].set_ylim(top=1.02)
+    caption(figure, f"{counts(records.of_task(records.tasks[0]))}, bands are 95% intervals")
+    legend_above(figure, styles)
+    save_figure(figure, path)
+
+
+def reliability_figure(records: Records, path: Path) -> None:
+    """How likely humans give the answers that beliefs held so likely, a panel for each task."""
+    styles = styles_of(records.strategies)
+    figure, axes = _panels(records)
+    for axis, task in zip(axes.flat, records.tasks, strict=False):
+        axis.plot((0, 1), (0, 1), color="#bbbbbb", lw=1)
+        own = records.of_task(task)
+        for key in filter(is_drawn, own.strategies):
+            predicted, given = reliability(own, key)
+            _, color, line = styles[key]
+            axis.plot(predicted, given, color=color, linestyle=line, marker=".", label=key)
+        axis.set(xlabel="predicted probability of an answer", xlim=(0, 1), ylim=(0, 1))
+        axis.grid(alpha=0.25)
+    for row in axes:
+        row[0].set_ylabel("how likely humans give it")
+    caption(figure, "after the last query, on questions that nobody asked; all humans together")
+    legend_above(figure, styles)
+    save_figure(figure, path)
+
+
+def _panels(records: Records) -> tuple[Figure, Any]:
+    """A figure with a panel for each task, two in a row, and its axes."""
+    tasks = records.tasks
     columns = min(2, len(tasks))
     rows = math.ceil(len(tasks) / columns)
     size = (1 + 4.6 * columns, 4 * rows + 0.8)
@@ -50,22 +92,8 @@ def figure_1(records: Records, path: Path) -> None:
     for axis in axes.flat[len(tasks) :]:
         axis.set_visible(False)
     for axis, task in zip(axes.flat, tasks, strict=False):
-        own = records.of_task(task)
-        for key in own.strategies:
-            _draw(axis, key, alignment(own, key), styles)
-        axis.set(
-            title=fill(title_of(task), TITLE),
-            xlabel="queries asked",
-            xlim=(0, None),
-            ylim=(None, 1.02),
-        )
-        _finish(axis)
-    for row in axes:
-        row[0].set_ylabel("alignment (mean of cosines)")
-    n_humans = len(records.entries[0].values["alignment"])
-    caption(figure, f"{n_humans} humans, bands are 95% intervals")
-    legend_above(figure, styles)
-    save_figure(figure, path)
+        axis.set_title(fill(title_of(task), TITLE))
+    return figure, axes
 
 
 def heldout_figure(records: Records, path: Path) -> None:

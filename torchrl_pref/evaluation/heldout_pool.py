@@ -28,6 +28,7 @@ from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.envs.session import is_feed
 from torchrl_pref.evaluation.comparison import FIRST_EVALUATION_SEED
+from torchrl_pref.evaluation.metrics import make_exam
 from torchrl_pref.evaluation.own import find_makers, make_own, try_own
 from torchrl_pref.evaluation.records import Entry, entry_of
 from torchrl_pref.evaluation.run import draw_humans
@@ -131,19 +132,20 @@ def run_pool(job: Job) -> list[Entry]:
     judged = _judged(job, env, seed)
     lineup = [*_lineup(job, task, env, seed), *judged]
     torch.manual_seed(seed)  # of policies that draw their actions
-    results = run_side_by_side(make_env, humans, lineup)
+    exam = make_exam(job.settings, task, pool)
+    results = run_side_by_side(make_env, humans, lineup, exam)
     if job.cell.setup == "query" and job.cell.features != "balanced":
         greedy = Greedy(task.response_model)
         if len(pool) >= env.budget:
             setup = {**job.settings["setup"], "repeats": False}
             unrepeated = partial(make_env, settings={**job.settings, "setup": setup})
             key = "greedy_no_repeats"
-            results |= run_side_by_side(unrepeated, humans, [Entrant(key, greedy)])
+            results |= run_side_by_side(unrepeated, humans, [Entrant(key, greedy)], exam)
         belief = {**job.settings["belief"], "samples": FINE_SAMPLES}
         fine = partial(make_env, settings={**job.settings, "belief": belief})
         key = f"greedy_many_samples:M={FINE_SAMPLES}"
         few = humans[:FINE_HUMANS].select("human")
-        results |= run_side_by_side(fine, few, [Entrant(key, greedy)])
+        results |= run_side_by_side(fine, few, [Entrant(key, greedy)], exam)
     last = dict.fromkeys(entrant.key for entrant in judged)  # their rows come last
     entries = []
     for key in [*(key for key in results if key not in last), *last]:

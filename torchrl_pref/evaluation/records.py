@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from torchrl_pref.errors import InputError
+from torchrl_pref.evaluation.metrics import BINS, PARTS
 from torchrl_pref.evaluation.run import Evaluation
 from torchrl_pref.storage.writing import replacing
 
@@ -41,6 +42,10 @@ CSV, PARQUET = "records.csv.gz", "records.parquet"
 """Compressed, as each number comes with all that says of what it is: the held-out protocol has two
 million rows, 130 MB as plain text and some 15 MB like this. pandas, polars and R read it as it
 is."""
+
+
+RELIABILITY = tuple(f"{part}_in_bin_{place}" for part in PARTS for place in range(BINS))
+"""Metrics of all humans together after the last answer, see ``metrics.reliability``."""
 
 
 @dataclass(frozen=True)
@@ -119,16 +124,20 @@ def entry_of(evaluation: Evaluation, curves: Iterable[str], seconds: str, **iden
 
     Args:
         evaluation: of one strategy.
-        curves: the metrics that are kept after each number of answers; of the others the last.
+        curves: what is kept after each number of answers, beside the metrics that were asked for;
+            of the others the last.
         seconds: the name of the metric that ``seconds_per_query`` is.
         identity: protocol, task, pool, seed and strategy.
     """
     values: dict[str, Tensor] = {}
-    for name, value in vars(evaluation).items():
+    for name, value in (vars(evaluation) | evaluation.metrics).items():
         if isinstance(value, Tensor):
-            last = value.ndim == 2 and name not in curves
+            last = value.ndim == 2 and name not in (*curves, *evaluation.examined)
             values[name] = (value[:, -1] if last else value).float().clone()
     values[seconds] = torch.tensor(evaluation.seconds_per_query)
+    if "calibration" in evaluation.examined:
+        bins = evaluation.examined["calibration"][:, -1].mean(0)
+        values |= dict(zip(RELIABILITY, bins, strict=True))
     return Entry(values=values, **identity)
 
 

@@ -1,10 +1,11 @@
-"""Files of an evaluation: its records, and the tables, curves and figure that are views of them."""
+"""Files of an evaluation: its records, and the tables, curves and figures that show them."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from torchrl_pref.evaluation.figures import figure_1, heldout_figure
+from torchrl_pref.evaluation.figures import figure_1, heldout_figure, reliability_figure
+from torchrl_pref.evaluation.metrics import ALWAYS, METRICS
 from torchrl_pref.evaluation.records import Records, write_records
 from torchrl_pref.evaluation.tables import tables
 from torchrl_pref.evaluation.views import write_curves
@@ -18,5 +19,12 @@ def write_report(folder: Path, records: Records) -> None:
     write_text(folder / "tables.txt", text)
     write_curves(folder / "curves.csv", records)
     (heldout_figure if heldout else figure_1)(records, folder / picture)
-    written = ["tables.txt", "curves.csv", picture, *write_records(folder, records)]
+    pictures = [picture]
+    for metric in (name for name in METRICS if name in records.metrics and name not in ALWAYS):
+        figure_1(records, folder / f"{metric}.png", metric)
+        pictures.append(f"{metric}.png")
+    if "calibration" in records.metrics:
+        reliability_figure(records, folder / "reliability.png")
+        pictures.append("reliability.png")
+    written = ["tables.txt", "curves.csv", *pictures, *write_records(folder, records)]
     print(f"\n{text}\nwritten to {folder}: {', '.join(written)}")

@@ -6,7 +6,8 @@ Shapes: B humans, H query budget. Curves are (B H+1): column j is the state afte
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -16,6 +17,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from torchrl_pref.envs.objectives import alignment, alignment_of_mean
+from torchrl_pref.evaluation.metrics import Exam, Standing, calibration, measure
 
 CURVES = ("alignment", "alignment_of_mean", "information", "ess")
 
@@ -35,7 +37,8 @@ class Evaluation:
         offered: (B), queries offered; equal to ``asked`` where the strategy chooses.
         repeated: (B), asked queries that had been asked before.
         seconds_per_query: wall time of the whole session (choice, answer, belief) over the queries
-            asked of all B humans.
+            asked of all B humans; measuring what was asked for beside alignment is not in it.
+        examined: (B H+1 …), the metrics that were asked for, as they were measured.
 
     Where a session ended before j answers, column j holds its last value.
     """
@@ -48,6 +51,54 @@ class Evaluation:
     offered: Tensor
     repeated: Tensor
     seconds_per_query: float
+    examined: Mapping[str, Tensor] = field(default_factory=dict)
+
+    @property
+    def metrics(self) -> dict[str, Tensor]:
+        """The metrics that were asked for beside alignment, by name (B H+1)."""
+        return {
+            name: calibration(values) if name == "calibration" else values.squeeze(-1)
+            for name, values in self.examined.items()
+        }
+
+
+class Examiner:
+    """Measures the beliefs of sessions, and again only those that an answer has changed.
+
+    Args:
+        exam: what by; None measures nothing.
+        env: whose humans and beliefs they are.
+        session: as it begins.
+    """
+
+    def __init__(self, exam: Exam | None, env: EnvBase, session: TensorDictBase) -> None:
+        self.exam, self.seconds = exam, 0.0
+        self.n_asked = torch.full_like(session["session", "n_asked"], -1)
+        self.values: dict[str, Tensor] = {}
+        if exam is not None:
+            human = session["human"]
+            self.model, self.omega = env.belief.response_model, human["omega"]
+            seen = exam.seen.to(self.omega)
+            self.answers = env.human.log_probs(seen.expand(len(human), *seen.shape), human).exp()
+
+    def __call__(self, session: TensorDictBase) -> dict[str, Tensor]:
+        """The metrics of the sessions as they stand, (B …) by name."""
+        if self.exam is None:
+            return {}
+        kept = session["session"]
+        who = (kept["n_asked"] != self.n_asked).squeeze(-1).nonzero().squeeze(-1)
+        if not len(who):
+            return self.values
+        start = time.perf_counter()
+        standing = Standing(
+            *(kept["samples"][who], self.omega[who], self.answers[who]), self.exam, self.model
+        )
+        for name, values in measure(self.exam.metrics, standing).items():
+            before = self.values.get(name, values)
+            self.values[name] = before.index_copy(0, who, values)
+        self.n_asked = kept["n_asked"].clone()
+        self.seconds += time.perf_counter() - start
+        return self.values
 
 
 def draw_humans(env: EnvBase) -> TensorDict:
@@ -62,6 +113,7 @@ def evaluate(
     strategy: TensorDictModuleBase,
     humans: TensorDictBase,
     sample: bool = False,
+    exam: Exam | None = None,
 ) -> Evaluation:
     """Run one session with each human.
 
@@ -70,30 +122,34 @@ def evaluate(
         strategy: writes ``action``.
         humans: as drawn by :func:`draw_humans`.
         sample: whether a stochastic policy draws its actions or takes the most likely one.
+        exam: what to measure beside alignment, and by what questions.
     """
     mode = ExplorationType.RANDOM if sample else ExplorationType.DETERMINISTIC
     session = env.reset(humans.clone(), set_state=True)
     omega = session["human", "omega"]
-    before = _measured(session, omega).cpu()
+    examiner = Examiner(exam, env, session)
+    before = _measured(session, omega, examiner).cpu()
+    examiner.seconds = 0.0
     start = time.perf_counter()
     steps: list[TensorDictBase] = []
     with torch.no_grad(), set_exploration_type(mode):
         # Not a rollout: that would keep what is on the table, a copy of the pool for each session.
         while len(steps) < env.max_steps and not session["done"].all():
             session = step_mdp(env.step(strategy(session)))
-            steps.append(_measured(session, omega))
+            steps.append(_measured(session, omega, examiner))
     steps_taken = TensorDict.stack(steps, 1).to("cpu")
-    seconds = time.perf_counter() - start
+    seconds = time.perf_counter() - start - examiner.seconds
     n_asked = steps_taken["n_asked"].squeeze(-1)
     curves = {
-        name: _by_answers(before[name], steps_taken[name].squeeze(-1), n_asked, env.budget)
-        for name in CURVES
+        name: _by_answers(before[name], steps_taken[name], n_asked, env.budget)
+        for name in (*CURVES, *examiner.values)
     }
     asked = n_asked[:, -1]
     offered = steps_taken.get("n_offered", steps_taken["n_asked"])[:, -1, 0]
     history = session["session", "history", "index"].cpu()
     return Evaluation(
-        **curves,
+        **{name: curves[name].squeeze(-1) for name in CURVES},
+        examined={name: curves[name] for name in examiner.values},
         asked=asked,
         offered=offered,
         repeated=_count_repeats(history),
@@ -101,25 +157,26 @@ def evaluate(
     )
 
 
-def _measured(session: TensorDictBase, omega: Tensor) -> TensorDict:
+def _measured(session: TensorDictBase, omega: Tensor, examiner: Examiner) -> TensorDict:
     """What an evaluation reads of sessions as they stand, with humans of weights ω (B D)."""
     kept = session["session"]
     measured = {
         "alignment": alignment(kept["samples"], omega),
         "alignment_of_mean": alignment_of_mean(kept["samples"], omega),
         **{key: kept[key] for key in ("information", "ess", *COUNTS) if key in kept},
+        **examiner(session),
     }
     return TensorDict(measured, session.batch_size, device=session.device)
 
 
 def _by_answers(before: Tensor, values: Tensor, n_asked: Tensor, budget: int) -> Tensor:
-    """Curve (B H+1) by number of answers, from values (B T) by step and their start (B 1)."""
-    curve = before.repeat(1, budget + 1)
-    columns = torch.arange(budget + 1)
-    for value, count in zip(values.unbind(1), n_asked.unbind(1), strict=True):
-        # A skip changes nothing, so later steps with the same count write the same value again.
-        curve = torch.where(columns >= count.unsqueeze(1), value.unsqueeze(1), curve)
-    return curve
+    """Curve (B H+1 …) by number of answers, from values (B T …) by step and their start (B …).
+
+    A count never falls from one step (B T) to the next.
+    """
+    last = (n_asked.unsqueeze(-1) <= torch.arange(budget + 1)).sum(1)
+    rows = torch.arange(len(last)).unsqueeze(-1)
+    return torch.cat([before.unsqueeze(1), values], 1)[rows, last]
 
 
 def _count_repeats(history: Tensor) -> Tensor:

@@ -18,6 +18,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
+from torchrl_pref.evaluation.metrics import Exam
 from torchrl_pref.evaluation.run import Evaluation, evaluate
 
 MakeEnv = Callable[[int], QueryEnv | FeedEnv]
@@ -68,7 +69,10 @@ class Chorus(TensorDictModuleBase):
 
 
 def run_side_by_side(
-    make_env: MakeEnv, humans: TensorDictBase, entrants: Sequence[Entrant]
+    make_env: MakeEnv,
+    humans: TensorDictBase,
+    entrants: Sequence[Entrant],
+    exam: Exam | None = None,
 ) -> dict[str, list[Evaluation]]:
     """Every strategy with the same humans (B), in one batch; a list holds the runs of a key.
 
@@ -76,12 +80,13 @@ def run_side_by_side(
     """
     count, chorus = len(humans), Chorus(entrants)
     env = make_env(count * len(entrants))
-    whole = evaluate(env, chorus, torch.cat([humans] * len(entrants)))
+    whole = evaluate(env, chorus, torch.cat([humans] * len(entrants)), exam=exam)
     results: dict[str, list[Evaluation]] = {}
     for number, entrant in enumerate(entrants):
         rows = slice(number * count, (number + 1) * count)
         own = {key: value[rows] for key, value in vars(whole).items() if isinstance(value, Tensor)}
+        examined = {name: values[rows] for name, values in whole.examined.items()}
         seconds = chorus.seconds[number] / max(1, int(own["asked"].sum()))
-        result = replace(whole, **own, seconds_per_query=seconds)
+        result = replace(whole, **own, examined=examined, seconds_per_query=seconds)
         results.setdefault(entrant.key, []).append(result)
     return results

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from tabulate import tabulate
 from torch import Tensor
 
+from torchrl_pref.evaluation.metrics import METRICS
 from torchrl_pref.evaluation.records import Records
 from torchrl_pref.evaluation.style import (
     KINDS,
@@ -142,8 +143,7 @@ def _last(digits: int) -> Callable[[Tensor], str]:
 
 
 DETAILS: dict[str, tuple[str, Callable[[Tensor], str]]] = {
-    "alignment": ("mean of cosines", _last(3)),
-    "alignment_of_mean": ("cosine of mean", _last(3)),
+    **{name: (metric.head, _last(3)) for name, metric in METRICS.items()},
     "information": ("bits", _last(2)),
     "ess": ("ESS", lambda v: f"{(v[..., 1:] if v.ndim == 4 else v).mean():.0f}"),
     "asked": ("asked", _last(1)),

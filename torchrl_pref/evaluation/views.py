@@ -12,7 +12,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchrl_pref.evaluation.records import Records
+from torchrl_pref.evaluation.metrics import BINS, PARTS
+from torchrl_pref.evaluation.records import RELIABILITY, Records
 from torchrl_pref.evaluation.statistics import bootstrap_interval
 from torchrl_pref.evaluation.style import baseline_of, is_feed, is_judged
 from torchrl_pref.storage.writing import replacing
@@ -26,6 +27,16 @@ def milestones(budget: int) -> list[int]:
 def alignment(records: Records, key: str) -> Tensor:
     """Of a strategy, after each number of answers (P S B H+1)."""
     return records.values(key, "alignment")
+
+
+def reliability(records: Records, key: str) -> tuple[Tensor, Tensor]:
+    """Of a strategy's beliefs after the last answer, over all pools and seeds: the mean probability
+    that was predicted of the answers in each bin, and how likely the humans give them; of bins
+    with an answer in ten thousand at least (G' each)."""
+    parts = torch.stack([records.values(key, name).mean() for name in RELIABILITY])
+    answers, predicted, given = parts.unflatten(0, (len(PARTS), BINS))
+    enough = answers >= 1e-4
+    return predicted[enough] / answers[enough], given[enough] / answers[enough]
 
 
 def difference(records: Records, key: str, other: str) -> Tensor:

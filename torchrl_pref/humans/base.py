@@ -57,9 +57,29 @@ class HumanBase(ABC):
             InputError: the returns are not finite.
         """
 
+    def log_probs(self, queries: Tensor, human: TensorDictBase | Mapping[str, Tensor]) -> Tensor:
+        """How likely each answer of theirs is, where they answer: without the luck.
+
+        Only who knows the human can tell it. Here it is what the response model says at their ω;
+        whoever answers otherwise says so by a method of their own.
+
+        Args:
+            queries: (B … K D), features of the options, as they see them.
+            human: as drawn; of those who change, as they are in the end.
+
+        Returns:
+            (B … R), natural logarithm.
+        """
+        return self.response_model(returns_of(queries, human["omega"]))
+
     def step_weights(self, n_steps: int) -> Tensor | None:
         """(T), how much each step of a trajectory counts to them: they see queries so weighted.
 
         None, as here, where they see what the belief sees: the features of whole trajectories.
         """
         return None
+
+
+def returns_of(queries: Tensor, omega: Tensor) -> Tensor:
+    """Returns (B … K) of the options of queries (B … K D) to people of weights (B D)."""
+    return (queries.flatten(1, -2) @ omega.unsqueeze(-1)).reshape(queries.shape[:-1])

@@ -10,15 +10,17 @@ Shapes: B sessions, K options per query, R possible answers, T trajectory length
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.nn import functional as F
 
 from torchrl_pref.errors import InputError, check_finite_number, check_not_negative, check_share
 from torchrl_pref.humans.base import REFUSED
-from torchrl_pref.humans.simulated import SimulatedHuman, at_turn
+from torchrl_pref.humans.simulated import SimulatedHuman
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.questions.responses import Boltzmann
 from torchrl_pref.questions.weak import Weak
@@ -75,15 +77,13 @@ class Undecided(SimulatedHuman):
         self.threshold = check_not_negative("threshold", threshold)
         self.picks = Boltzmann(response_model.scale, lapse=response_model.lapse)
 
-    def respond(
-        self, queries: Tensor, human: TensorDictBase | Mapping[str, Tensor], turn: Tensor
-    ) -> Tensor:
-        """See :meth:`HumanBase.respond`: 2 is "about equal"."""
-        returns = (queries @ human["omega"].unsqueeze(-1)).squeeze(-1)
-        noise = at_turn(human["noise"], turn)
-        picked = (self.picks(returns) + noise[:, :2]).argmax(-1)
-        gap = self.picks.tau * (returns[:, 0] - returns[:, 1]).abs()
-        return torch.where(gap < self.threshold, 2, picked)
+    def log_probs(self, queries: Tensor, human: TensorDictBase | Mapping[str, Tensor]) -> Tensor:
+        """See :meth:`HumanBase.log_probs`: 2 is "about equal", for certain or not at all."""
+        returns = self.returns(queries, human)
+        gap = self.picks.tau * (returns[..., 0] - returns[..., 1]).abs()
+        picked = F.pad(self.picks(returns), (0, 1), value=-math.inf)
+        equal = picked.new_tensor([-math.inf, -math.inf, 0.0])
+        return torch.where((gap < self.threshold).unsqueeze(-1), equal, picked)
 
 
 class Myopic(SimulatedHuman):

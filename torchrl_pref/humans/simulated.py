@@ -13,7 +13,7 @@ from torch import Generator, Tensor
 
 from torchrl_pref.beliefs.sampled import uniform_sphere
 from torchrl_pref.errors import InputError, check_positive, check_type
-from torchrl_pref.humans.base import HumanBase
+from torchrl_pref.humans.base import HumanBase, returns_of
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.tensors import check_finite
 
@@ -59,9 +59,22 @@ class SimulatedHuman(HumanBase):
         self, queries: Tensor, human: TensorDictBase | Mapping[str, Tensor], turn: Tensor
     ) -> Tensor:
         """See :meth:`HumanBase.respond`; by the Gumbel-max trick."""
-        returns = (queries @ human["omega"].unsqueeze(-1)).squeeze(-1) * human["care"]
+        return (self.log_probs(queries, human) + at_turn(human["noise"], turn)).argmax(-1)
+
+    def log_probs(self, queries: Tensor, human: TensorDictBase | Mapping[str, Tensor]) -> Tensor:
+        """See :meth:`HumanBase.log_probs`; as careful as they are."""
+        return self.response_model(self.returns(queries, human))
+
+    def returns(self, queries: Tensor, human: TensorDictBase | Mapping[str, Tensor]) -> Tensor:
+        """What the options of queries (B … K D) are worth to them, times their care (B … K).
+
+        Raises:
+            InputError: a return is not finite.
+        """
+        returns = returns_of(queries, human["omega"])
+        returns = returns * human["care"].view(-1, *(1,) * (returns.ndim - 1))
         check_finite("the human's returns (queries @ omega * care)", returns)
-        return (self.response_model(returns) + at_turn(human["noise"], turn)).argmax(-1)
+        return returns
 
 
 def at_turn(drawn: Tensor, turn: Tensor) -> Tensor:

@@ -34,7 +34,7 @@ def test_every_strategy_asks_new_questions_through_a_rollout(
 
 @pytest.mark.parametrize("name", BATCHES)
 def test_a_batch_of_sessions_is_chosen_for_as_each_alone(name: str, pool: QueryPool) -> None:
-    env = env_of(pool, repeats=False)
+    env = env_of(pool, repeats=False, candidates=30)  # others for each session
     strategy = BATCH_STRATEGIES[name](env)
     session = env.step_mdp(env.step(BATCH_STRATEGIES["random"](env)(env.reset())))
     together = strategy(session.clone())["action"]

@@ -131,7 +131,7 @@ def known_keys() -> set[str]:
     """Every key that a script has, whatever is chosen."""
     groups = ("setup=query", "setup=feed", "question=weak", "belief=rationality")
     groups += ("policy=attention", "policy=scorer")
-    tasks = ("task=lds", "task=gymnasium", "task=torchrl", "task=files", "task=minari")
+    tasks = [f"task={name}" for name in TASKS]
     humans = [f"human={name}" for name in HUMANS]
     typed_here = [("train", one) for one in (*groups, *tasks, *humans, "algorithm=ppo")]
     typed_here += [(script, one) for script in ("evaluate", "ask") for one in groups[:4]]

@@ -16,6 +16,7 @@ from conftest import RESPONSE_MODELS
 from helpers import coin, make, settings_of
 from torch import Generator, Tensor
 
+from torchrl_pref.acquisition.scoring import mean_answers
 from torchrl_pref.beliefs.sampled import uniform_sphere
 from torchrl_pref.build import make_pools, make_query_env, make_task
 from torchrl_pref.config.settings import METRICS as NAMES
@@ -48,6 +49,7 @@ from torchrl_pref.evaluation.views import reliability as reliability_of
 from torchrl_pref.humans import HUMANS
 from torchrl_pref.humans.simulated import SimulatedHuman
 from torchrl_pref.pool import QueryPool
+from torchrl_pref.questions.approve import Approve
 from torchrl_pref.questions.choice import Choice
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.questions.responses import Boltzmann, Optimal
@@ -339,3 +341,26 @@ def test_metrics_that_may_be_typed() -> None:
     for typed in ("calibration", "[calibration,calibration]", "[luck]", "5", "null"):
         with pytest.raises(InputError, match=r"evaluation\.metrics"):
             check_evaluate_settings(composed("evaluate", f"evaluation.metrics={typed}"))
+
+
+@pytest.mark.parametrize(
+    ("model", "n_options"),
+    [
+        *((model, n_options) for model in RESPONSE_MODELS for n_options in (2, 3)),
+        (Boltzmann(2.0, Weak(1.0)), 2),
+        (Boltzmann(2.0, Approve(0.0)), 1),
+        (Boltzmann(4.4, lapse=0.1), 2),
+        (Optimal(lapse=0.1), 2),
+    ],
+    ids=str,
+)
+def test_mean_answers_are_the_means_of_what_samples_predict(
+    model: ResponseModel, n_options: int
+) -> None:
+    rng = Generator().manual_seed(5)
+    samples = uniform_sphere((2, 3000, 4), rng)  # fifty queries are beyond a chunk
+    queries = torch.randn(2, 50, n_options, 4, generator=rng)
+    queries[0, 0] = queries[0, 0, :1]  # a tie
+    returns = torch.einsum("bckd,bmd->bcmk", queries, samples)
+    expected = model(returns).exp().mean(-2)
+    assert torch.allclose(mean_answers(samples, queries, model), expected, atol=1e-5)

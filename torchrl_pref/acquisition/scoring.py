@@ -6,6 +6,7 @@ D features, ``…`` any leading dimensions.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -38,10 +39,26 @@ def predict_answers(samples: Tensor, queries: Tensor, response_model: ResponseMo
     if queries.shape[2] == 1:  # no other to lead over
         returns = queries.flatten(1, 2) @ samples.mT
         return response_model.predict_of_returns(returns.unsqueeze(-1))
+    return response_model.predict(_leads(samples, queries))
+
+
+def mean_answers(samples: Tensor, queries: Tensor, response_model: ResponseModel) -> Tensor:
+    """How likely each answer to each query is to the belief as a whole, (B C R): the mean of
+    :func:`predict_answers` over the samples, in chunks."""
+
+    def part(belief: Tensor, shown: Tensor) -> Tensor:
+        if shown.shape[2] == 1:
+            return predict_answers(belief, shown, response_model).probs.mean(-2)
+        return response_model.mean_answer(_leads(belief, shown))
+
+    return _in_chunks(samples, queries, response_model, part)
+
+
+def _leads(samples: Tensor, queries: Tensor) -> Tensor:
+    """By how much each option's return exceeds that of the last one (B C M K-1)."""
     leads = queries[..., :-1, :] - queries[..., -1:, :]
     # M is the innermost axis in memory, as the sums over it are the bulk of the work.
-    returns = (leads.flatten(1, 2) @ samples.mT).unflatten(1, leads.shape[1:3])
-    return response_model.predict(returns.mT)
+    return (leads.flatten(1, 2) @ samples.mT).unflatten(1, leads.shape[1:3]).mT
 
 
 COMPILED: tuple[Acquisition, ...] = (information_gain, alignment_gain, volume_removal)
@@ -111,9 +128,23 @@ def score_in_tensors(
     response_model: ResponseModel,
     acquisition: Acquisition,
 ) -> Tensor:
-    """:func:`score_queries` for any model, function, device and type, and with gradients.
+    """:func:`score_queries` for any model, function, device and type, and with gradients."""
 
-    It goes in chunks, so that memory stays bounded whatever B, C and M are.
+    def part(belief: Tensor, shown: Tensor) -> Tensor:
+        return acquisition(predict_answers(belief, shown, response_model), belief)
+
+    return _in_chunks(samples, queries, response_model, part)
+
+
+def _in_chunks(
+    samples: Tensor,
+    queries: Tensor,
+    response_model: ResponseModel,
+    part: Callable[[Tensor, Tensor], Tensor],
+) -> Tensor:
+    """What a function makes of beliefs (B M D) and their queries (B C K D), (B C …).
+
+    Memory stays bounded whatever B, C and M are.
     """
     sessions, candidates = queries.shape[:2]
     n_answers = response_model.n_answers(queries.shape[2])
@@ -124,10 +155,7 @@ def score_in_tensors(
     for start in range(0, sessions, group):
         belief, shown = samples[start : start + group], queries[start : start + group]
         parts = [
-            acquisition(
-                predict_answers(belief, shown[:, first : first + step], response_model), belief
-            )
-            for first in range(0, candidates, step)
+            part(belief, shown[:, first : first + step]) for first in range(0, candidates, step)
         ]
         rows.append(torch.cat(parts, 1))
     return torch.cat(rows)

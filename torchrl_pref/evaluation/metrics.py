@@ -18,13 +18,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrl_pref.acquisition.scoring import score_in_tensors
+from torchrl_pref.acquisition.scoring import mean_answers
 from torchrl_pref.build import human_of, weigh_steps
 from torchrl_pref.config.sections import Settings
 from torchrl_pref.envs.objectives import alignment, alignment_of_mean
 from torchrl_pref.pool import QueryPool
 from torchrl_pref.problem import Problem
-from torchrl_pref.questions.response_model import Prediction, ResponseModel
+from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.tensors import directions
 
 QUESTIONS = 100
@@ -76,18 +76,13 @@ class Standing:
     def predicted(self) -> Tensor:
         """(B N R), how likely the beliefs hold each answer to be."""
         queries = self.exam.queries.expand(len(self.samples), *self.exam.queries.shape)
-        return score_in_tensors(self.samples, queries, self.response_model, _mean_answer)
+        return mean_answers(self.samples, queries, self.response_model)
 
     @cached_property
     def rewards(self) -> tuple[Tensor, Tensor]:
         """(B T) and (B T), of the trajectories: to the humans, and as the beliefs expect."""
         learned = directions(self.samples).mean(-2)
         return self.omega @ self.exam.trajectories.mT, learned @ self.exam.trajectories.mT
-
-
-def _mean_answer(predicted: Prediction, samples: Tensor) -> Tensor:
-    """(B C R), how likely each answer is to a belief as a whole."""
-    return predicted.probs.mean(-2)
 
 
 def accuracy(standing: Standing) -> Tensor:

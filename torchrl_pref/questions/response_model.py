@@ -191,6 +191,15 @@ class ResponseModel(ABC):
         returns = torch.stack([*columns, torch.zeros_like(columns[0])]).movedim(0, -1)
         return self.predict_of_returns(returns)
 
+    def mean_answer(self, leads: Tensor) -> Tensor:
+        """How likely each answer to a query of K ≥ 2 options is to M samples as a whole, (… R): the
+        mean of the probabilities that :meth:`predict` gives, without their entropy.
+
+        Args:
+            leads: (… M K-1), see :meth:`predict`.
+        """
+        return self.predict(leads).probs.mean(-2)
+
     def predict_of_returns(self, returns: Tensor) -> Prediction:
         """What M samples of the weights predict of the answer.
 

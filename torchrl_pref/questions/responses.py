@@ -100,6 +100,13 @@ class Boltzmann(ResponseModel):
         entropy = logit.abs_().mul_(unlikely).mean(-1) - sum_of_logs(likely) / logit.shape[-1]
         return Prediction(probs, entropy, leads)
 
+    def mean_answer(self, leads: Tensor) -> Tensor:
+        """See :meth:`ResponseModel.mean_answer`."""
+        if leads.shape[-1] > 1 or not self.is_plain:
+            return super().mean_answer(leads)
+        first = torch.sigmoid(self.tau * leads.squeeze(-1)).mean(-1)
+        return torch.stack([first, 1 - first], -1)
+
     def __repr__(self) -> str:
         return f"Boltzmann(tau={shown(self.tau)}{_beside(self)})"
 
@@ -170,6 +177,13 @@ class Optimal(ResponseModel):
         entropy = math.log(2) * (1 - winner.abs().mean(-1))
         probs = torch.stack([winner + 1, 1 - winner]).movedim(0, -1) / 2
         return Prediction(probs, entropy, leads)
+
+    def mean_answer(self, leads: Tensor) -> Tensor:
+        """See :meth:`ResponseModel.mean_answer`."""
+        if leads.shape[-1] > 1 or not self.is_plain:
+            return super().mean_answer(leads)
+        winner = F.hardshrink(leads.squeeze(-1), self.tolerance).sign().mean(-1)
+        return torch.stack([1 + winner, 1 - winner], -1) / 2
 
     def __repr__(self) -> str:
         tolerance = "" if self.tolerance == TOLERANCE else f", tolerance={shown(self.tolerance)}"

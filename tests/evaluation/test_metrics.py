@@ -215,6 +215,9 @@ def test_humans_answer_as_likely_as_they_say(name: str) -> None:
     queries = torch.randn(5, 2, 4, generator=rng)
     likely = human.log_probs(queries.expand(4000, 5, 2, 4), drawn).exp()
     assert torch.allclose(likely.sum(-1), torch.ones(4000, 5), atol=1e-5)
+    if name == "simulated":  # half as careful is half of tau
+        expected = Boltzmann(1.0, question, 0.1)(queries @ drawn["omega"][0]).exp()
+        assert torch.allclose(likely[0], expected, atol=1e-5)
     for place, query in enumerate(queries):
         given = human.respond(query.expand(4000, 2, 4), drawn, torch.full((4000,), 2))
         given = given[given >= 0]

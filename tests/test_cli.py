@@ -30,7 +30,7 @@ from torchrl_pref.training.progress import Progress
 ROOT = Path(__file__).parent.parent
 
 TINY_TASK = ["belief.samples=10", "belief.moves=1", "pool.size=40", "setup.budget=4"]
-TINY_TASK += ["evaluation.humans=6"]
+TINY_TASK += ["evaluation.humans=6", "evaluation.metrics=[]"]
 TINY = [*TINY_TASK, "training.updates=3", "training.sessions=4", "training.steps=8"]
 
 

@@ -121,14 +121,14 @@ def test_kills_and_double_starts(tmp_path: Path) -> None:
     """A few of ``benchmarks/kills.py``, which says so where anything is lost or mixed."""
     script = [sys.executable, str(ROOT / "benchmarks" / "kills.py")]
     done = subprocess.run(
-        [*script, "--kills=1", "--starts=3", "--seed=1"],
+        [*script, "--kills=1", "--starts=1", "--seed=1"],
         env={**os.environ, "OMP_NUM_THREADS": "1", "TMPDIR": str(tmp_path)},
         capture_output=True,
         text=True,
         timeout=300,
     )
     assert done.returncode == 0, done.stderr
-    assert len(re.findall(r"\b0 lost or mixed", done.stdout)) == 4
+    assert len(re.findall(r"\b0 lost or mixed", done.stdout)) == 2
     assert not list(tmp_path.iterdir())
 
 

@@ -112,7 +112,7 @@ def test_calibration(
     model: ResponseModel, n_features: int, n_options: int, generator: Generator
 ) -> None:
     """Simulation-based calibration (Talts et al., 2018): the rank of the truth is uniform."""
-    sessions, budget = 10_000 // n_features, 8
+    sessions, budget = 6_000 // n_features, 8
     belief = Belief(model, samples=99)
     omega = uniform_sphere((sessions, n_features), generator)
     samples = belief.prior(sessions, n_features, generator)

@@ -365,14 +365,19 @@ def test_a_question_of_a_feed_that_is_only_looked_at_does_not_go_by() -> None:
 def test_a_feed_ends_with_its_offers() -> None:
     class Never(TensorDictModuleBase):
         in_keys, out_keys = ["offer"], ["action"]
+        decisions = 0
 
         def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+            Never.decisions += 1
             return tensordict.set("action", torch.zeros(1, dtype=torch.long))
 
     pool = gridworld_pool(50)
     session = Session(pool, MODEL, lambda env: Never(), budget=3, setup="feed", offers=7)
-    with pytest.raises(NothingToAsk, match="offers=7: all went by"):
-        session.ask()
+    for _ in range(3):  # nobody decides about the same offers again
+        with pytest.raises(NothingToAsk, match="offers=7: all went by"):
+            session.ask()
+        session = session.branch()
+    assert Never.decisions == 7
 
 
 def test_an_earlier_answer_is_taken_back_and_the_others_stay(generator: Generator) -> None:

@@ -5,7 +5,7 @@ Shapes: B people, N queries in the pool, K options per query, D features, O offe
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -141,6 +141,17 @@ def _let_through(
         index = torch.where(waiting & asks, env.offered(present, hidden), index)
         n_offered = n_offered + waiting.unsqueeze(-1)
     return index, n_offered
+
+
+def query_indices(queries: Sequence[int], size: int, n_queries: int) -> Tensor:
+    """(B), pool queries as they were named.
+
+    Raises:
+        InputError: one is not of the pool, or there are not B.
+    """
+    if len(queries) != size or not all(0 <= query < n_queries for query in queries):
+        raise InputError(f"queries {queries!s:.80}: expected {size} of the {n_queries}")
+    return torch.tensor(queries)
 
 
 def check_same(content: Mapping[str, Any], made_with: Mapping[str, Any]) -> None:

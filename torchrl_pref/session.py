@@ -21,6 +21,7 @@ from torchrl_pref.asking import (
     draw_questions,
     make_env,
     next_question,
+    query_indices,
     strategy_of,
 )
 from torchrl_pref.beliefs.base import BeliefBase
@@ -126,6 +127,7 @@ class Session(Learned):
         self._states, self._given = [state], given_digest(given)
         self._turns: list[Turn] = []
         self._asked: Tensor | None = None
+        self._nothing: NothingToAsk | None = None  # where that was found out already
         # Offers that went by, until the present question and until the one that was answered last.
         self._n_offered = self._n_gone = torch.zeros(size, 1, dtype=torch.long)
 
@@ -147,10 +149,15 @@ class Session(Learned):
                     f"budget={self.budget}: all questions are answered; expected a larger budget "
                     "where more are to be asked"
                 )
+            if self._nothing is not None:
+                raise self._nothing
             state: SessionState = {**self._states[-1], "n_offered": self._n_gone}
-            asked, offered = next_question(
-                self._env, self._strategy, state, self._hidden, self._luck
-            )
+            given = self._env, self._strategy, state, self._hidden, self._luck
+            try:
+                asked, offered = next_question(*given)
+            except NothingToAsk as nothing:
+                self._nothing = nothing
+                raise
             self._asked, self._n_offered = asked, self._n_gone if offered is None else offered
         index, shown_to = self._asked, self.pool.trajectories
         trajectories = None if shown_to is None else self._plain(shown_to[index])
@@ -211,7 +218,7 @@ class Session(Learned):
         """
         if self.n_answered >= self.budget:
             raise NothingToAsk(f"budget={self.budget}: all questions are answered")
-        self._asked = self._index_of([query] if isinstance(query, int) else list(query))
+        self._asked = self._queries([query] if isinstance(query, int) else [*query])
         self._n_offered = self._n_gone
         if n_offered is not None:
             self._n_offered = torch.full_like(self._n_gone, check_count("n_offered", n_offered, 0))
@@ -300,9 +307,9 @@ class Session(Learned):
         check_same(content, session.to_dict())
         for queries, answers in zip(content["queries"], content["answers"], strict=True):
             said = session._said([None if answer == REFUSED else answer for answer in answers])
-            session._let_in(Turn(session._index_of(queries), said))
+            session._let_in(Turn(session._queries(queries), said))
         if content["asked"] is not None:
-            session._asked = session._index_of(content["asked"])
+            session._asked = session._queries(content["asked"])
         if content["offered"] is not None and content["gone"] is not None:
             session._n_offered = torch.tensor(content["offered"]).view_as(session._n_gone)
             session._n_gone = torch.tensor(content["gone"]).view_as(session._n_gone)
@@ -336,15 +343,8 @@ class Session(Learned):
         before, belief = self._states[-1], self._belief
         self._states.append(tell(belief, before, options, turn.answers, turn.query, generator))
         self._turns.append(turn)
-        self._asked = None
+        self._asked = self._nothing = None
 
-    def _index_of(self, queries: list[int]) -> Tensor:
-        """(B), queries of the pool.
-
-        Raises:
-            InputError: one is not of the pool, or there are not B.
-        """
-        size = self._env.batch_size.numel()
-        if len(queries) != size or not all(0 <= query < len(self.pool) for query in queries):
-            raise InputError(f"queries {queries!s:.80}: expected {size} of the {len(self.pool)}")
-        return torch.tensor(queries)
+    def _queries(self, indices: list[int]) -> Tensor:
+        """(B), queries of the pool."""
+        return query_indices(indices, self._env.batch_size.numel(), len(self.pool))

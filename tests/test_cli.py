@@ -383,6 +383,9 @@ BAD_INPUT = [
     ("ask", "export={tmp}", "holds no study"),
     ("ask", "export={tmp} tau=2", "tau"),
     ("ask", "-m tau=1,2", "people answer one study at a time"),
+    ("evaluate", "setup=query setup.batch=10 strategy=max_regret", "chooses one query at a time"),
+    ("evaluate", "strategy=lookahead", "strategy=lookahead with setup=feed"),
+    ("evaluate", "task=gaussian task.dimension=9999", "expected a whole number from 2 to 1000"),
     ("evaluate", "evaluation.seed=x", "evaluation.seed='x': expected a whole number"),
 ]
 

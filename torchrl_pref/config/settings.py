@@ -223,6 +223,15 @@ def check_evaluate_settings(settings: Plain) -> Settings:
     check_keys(settings, TASK | EVALUATE, groups)
     if "policy" in settings:
         refuse_batches(settings, "policy=pretrained")
+    named = settings["strategy"]
+    for name in [named] if isinstance(named, str) else named or []:
+        if ":" not in name:
+            refuse_batches(settings, f"strategy={name}")
+        if name in ONLY_QUERY and settings["setup"]["name"] == "feed":
+            raise InputError(
+                f"strategy={name} with setup=feed: it looks ahead in a pool of questions; type "
+                "setup=query, or another strategy"
+            )
     check_together(settings)
     if "policy" in settings:
         one_or_more(choice("noisy", "optimal"))("tau", settings["tau"])

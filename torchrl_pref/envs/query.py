@@ -77,6 +77,11 @@ class QueryEnv(SessionEnv):
         self.n_candidates = len(pool)
         if candidates is not None:
             self.n_candidates = min(check_count("setup.candidates", candidates, 1), len(pool))
+        if self.n_candidates < self.batch:
+            raise InputError(
+                f"setup.batch={self.batch} with {self.n_candidates} candidates: expected at least "
+                "as many candidates as are asked at once; raise one or lower the other"
+            )
         if not repeats and self.n_candidates < budget:
             raise InputError(
                 f"setup.repeats=false with {self.n_candidates} candidates and setup.budget={budget}"

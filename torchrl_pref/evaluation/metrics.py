@@ -11,7 +11,7 @@ here draws a random number.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -52,6 +52,15 @@ class Exam:
     seen: Tensor
     trajectories: Tensor
     metrics: tuple[str, ...]
+
+    def to(self, device: torch.device) -> Exam:
+        """The same on a device."""
+        return replace(
+            self,
+            queries=self.queries.to(device),
+            seen=self.seen.to(device),
+            trajectories=self.trajectories.to(device),
+        )
 
 
 @dataclass(frozen=True)

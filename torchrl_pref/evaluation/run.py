@@ -78,6 +78,7 @@ class Examiner:
         if exam is not None:
             human = session["human"]
             self.model, self.omega = env.belief.response_model, human["omega"]
+            self.exam = exam = exam.to(self.omega.device)
             seen = exam.seen.to(self.omega)
             self.answers = env.human.log_probs(seen.expand(len(human), *seen.shape), human).exp()
 

@@ -8,10 +8,10 @@ from __future__ import annotations
 import torch
 from torch import Generator, Tensor
 
-from torchrl_pref.errors import check_between, check_count
+from torchrl_pref.errors import InputError, check_between, check_count, check_seed
 from torchrl_pref.tasks.base import Task
 
-LARGEST_SKEW = 1e6
+LARGEST_DIMENSION, LARGEST_SKEW = 1000, 1e6
 
 
 class GaussianTask(Task):
@@ -32,8 +32,12 @@ class GaussianTask(Task):
 
     def __init__(self, dimension: int = 4, skew: float = 50.0, axes: int = 0) -> None:
         self.dimension = check_count("dimension", dimension, 2)
+        if self.dimension > LARGEST_DIMENSION:
+            raise InputError(
+                f"dimension={dimension}: expected a whole number from 2 to {LARGEST_DIMENSION}"
+            )
         self.skew = check_between("skew", skew, 1.0, LARGEST_SKEW)
-        luck = Generator().manual_seed(check_count("axes", axes, 0))
+        luck = Generator().manual_seed(check_seed("axes", axes))
         turned, _ = torch.linalg.qr(torch.randn(dimension, dimension, generator=luck))
         shares = torch.linspace(0, 1, dimension)
         self._root = turned * self.skew ** (-shares / 2)

@@ -333,7 +333,6 @@ BAD_INPUT = [
     ("evaluate", "policy=pretrained checkpoint=x", "name two policies"),
     ("evaluate", "policy=pretrained skip=regret", "expected skip=free; remove skip"),
     ("evaluate", "strategy=mine", "strategy=mine: expected one of alignment_gain"),
-    ("evaluate", "setup=feed strategy=lookahead", "strategy='lookahead': expected one of random"),
     ("evaluate", "strategy=[]", "strategy=[]: expected at least one"),
     ("evaluate", "strategy=no_such_module:rule", "no module no_such_module in"),
     ("evaluate", "strategy=torch:no_such_rule", "has no no_such_rule"),

@@ -143,12 +143,13 @@ def _let_through(
     return index, n_offered
 
 
-def query_indices(queries: Sequence[int], size: int, n_queries: int) -> Tensor:
-    """(B), pool queries as they were named.
+def query_indices(env: QueryEnv | FeedEnv, queries: Sequence[int]) -> Tensor:
+    """(B), queries of an environment's pool, one for each of its people.
 
     Raises:
         InputError: one is not of the pool, or there are not B.
     """
+    size, n_queries = env.batch_size.numel(), len(env.features)
     if len(queries) != size or not all(0 <= query < n_queries for query in queries):
         raise InputError(f"queries {queries!s:.80}: expected {size} of the {n_queries}")
     return torch.tensor(queries)

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
-from torchrl_pref.acquisition.scoring import predict_answers
+from torchrl_pref.acquisition.scoring import mean_answers
 from torchrl_pref.asking import (
     Asked,
     NothingToAsk,
@@ -170,10 +170,7 @@ class Session(Learned):
         Raises:
             NothingToAsk: there is no question left.
         """
-        self.ask()
-        assert self._asked is not None
-        options, model = self.pool.features[self._asked], self._belief.response_model
-        return self._plain(expected_gain(self._states[-1]["samples"], options, model))
+        return self._plain(expected_gain(*self._present))
 
     @property
     def answer_probabilities(self) -> Tensor:
@@ -182,11 +179,8 @@ class Session(Learned):
         Raises:
             NothingToAsk: there is no question left.
         """
-        self.ask()
-        assert self._asked is not None
-        options, samples = self.pool.features[self._asked], self._states[-1]["samples"]
-        predicted = predict_answers(samples, options.unsqueeze(1), self._belief.response_model)
-        return self._plain(predicted.probs.mean(-2).squeeze(1))
+        samples, options, model = self._present
+        return self._plain(mean_answers(samples, options.unsqueeze(1), model).squeeze(1))
 
     def tell(self, answer: int | Sequence[int | None] | None) -> None:
         """Let in the answer to the question that :meth:`ask` gave.
@@ -218,7 +212,7 @@ class Session(Learned):
         """
         if self.n_answered >= self.budget:
             raise NothingToAsk(f"budget={self.budget}: all questions are answered")
-        self._asked = self._queries([query] if isinstance(query, int) else [*query])
+        self._asked = query_indices(self._env, [query] if isinstance(query, int) else [*query])
         self._n_offered = self._n_gone
         if n_offered is not None:
             self._n_offered = torch.full_like(self._n_gone, check_count("n_offered", n_offered, 0))
@@ -307,13 +301,22 @@ class Session(Learned):
         check_same(content, session.to_dict())
         for queries, answers in zip(content["queries"], content["answers"], strict=True):
             said = session._said([None if answer == REFUSED else answer for answer in answers])
-            session._let_in(Turn(session._queries(queries), said))
+            session._let_in(Turn(query_indices(session._env, queries), said))
         if content["asked"] is not None:
-            session._asked = session._queries(content["asked"])
+            session._asked = query_indices(session._env, content["asked"])
         if content["offered"] is not None and content["gone"] is not None:
             session._n_offered = torch.tensor(content["offered"]).view_as(session._n_gone)
             session._n_gone = torch.tensor(content["gone"]).view_as(session._n_gone)
         return session
+
+    @property
+    def _present(self) -> tuple[Tensor, Tensor, ResponseModel]:
+        """The belief (B M D), the options (B K D) of the present question, and how people are
+        thought to answer."""
+        self.ask()
+        assert self._asked is not None
+        options, model = self.pool.features[self._asked], self._belief.response_model
+        return self._states[-1]["samples"], options, model
 
     @property
     def _luck(self) -> int:
@@ -344,7 +347,3 @@ class Session(Learned):
         self._states.append(tell(belief, before, options, turn.answers, turn.query, generator))
         self._turns.append(turn)
         self._asked = self._nothing = None
-
-    def _queries(self, indices: list[int]) -> Tensor:
-        """(B), queries of the pool."""
-        return query_indices(indices, self._env.batch_size.numel(), len(self.pool))

@@ -34,7 +34,7 @@ from torchrl_pref.config.checks import (
 )
 from torchrl_pref.config.memory import check_memory
 from torchrl_pref.config.sections import Plain, Settings
-from torchrl_pref.config.together import check_together, refuse_batches
+from torchrl_pref.config.together import check_together, refuse_batches, refuse_lookahead
 from torchrl_pref.errors import (
     InputError,
     check_choice,
@@ -227,11 +227,7 @@ def check_evaluate_settings(settings: Plain) -> Settings:
     for name in [named] if isinstance(named, str) else named or []:
         if ":" not in name:
             refuse_batches(settings, f"strategy={name}")
-        if name in ONLY_QUERY and settings["setup"]["name"] == "feed":
-            raise InputError(
-                f"strategy={name} with setup=feed: it looks ahead in a pool of questions; type "
-                "setup=query, or another strategy"
-            )
+        refuse_lookahead(settings["setup"]["name"], name)
     check_together(settings)
     if "policy" in settings:
         one_or_more(choice("noisy", "optimal"))("tau", settings["tau"])

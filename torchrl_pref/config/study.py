@@ -20,7 +20,7 @@ from torchrl_pref.config.checks import (
 )
 from torchrl_pref.config.sections import Plain
 from torchrl_pref.config.settings import OTHERS, check_keys
-from torchrl_pref.config.together import check_belief, check_options
+from torchrl_pref.config.together import check_belief, check_options, refuse_lookahead
 from torchrl_pref.errors import (
     InputError,
     check_between,
@@ -141,11 +141,7 @@ def check_ask_settings(settings: Plain) -> Plain:
                 "questions as stream by, as nobody is asked one twice; raise it, or lower "
                 "setup.offers"
             )
-        if asks in ONLY_QUERY:
-            raise InputError(
-                f"strategy={asks} with setup=feed: it looks ahead in a pool of questions; type "
-                "setup=query, or another strategy"
-            )
+        refuse_lookahead(setup["name"], asks)
     elif pool["file"] is None and pool["size"] < setup["budget"]:
         raise InputError(
             f"pool.size={pool['size']} with setup.budget={setup['budget']}: expected at least as "

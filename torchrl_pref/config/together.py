@@ -5,6 +5,7 @@ from __future__ import annotations
 from importlib.util import find_spec
 from typing import Any
 
+from torchrl_pref.config.checks import ONLY_QUERY
 from torchrl_pref.config.sections import Plain
 from torchrl_pref.errors import InputError, check_batch, check_count
 
@@ -72,6 +73,19 @@ def refuse_batches(settings: Plain, who: str) -> None:
         raise InputError(
             f"setup.batch={batch}: {who} chooses one query at a time; set setup.batch=1, or "
             "compare batches by evaluate.py setup=query"
+        )
+
+
+def refuse_lookahead(setup: str, strategy: Any) -> None:
+    """Refuse in a feed what looks ahead in a pool of questions.
+
+    Raises:
+        InputError: it was asked for.
+    """
+    if setup == "feed" and strategy in ONLY_QUERY:
+        raise InputError(
+            f"strategy={strategy} with setup=feed: it looks ahead in a pool of questions; type "
+            "setup=query, or another strategy"
         )
 
 

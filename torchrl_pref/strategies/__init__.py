@@ -80,7 +80,7 @@ FEED_STRATEGIES: dict[str, MakeStrategy] = {
 """Strategies that ask or skip what is offered, by name: all that is offered, or the best share."""
 
 BATCH_STRATEGIES: dict[str, MakeStrategy] = {
-    "random": lambda env: RandomQuery(batch=env.batch),
+    "random": STRATEGIES["random"],
     **{name: partial(_batch_of, select=each) for name, each in BATCHES.items()},
 }
 """Strategies that choose n candidates of an environment with ``batch=n``, by name."""

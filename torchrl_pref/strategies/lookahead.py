@@ -7,6 +7,7 @@ answers, D features.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 
 import torch
 from tensordict import TensorDictBase
@@ -24,7 +25,36 @@ HELD = 4_000_000
 """Numbers (G D+1 C R) held at once: bounds memory."""
 
 
-class Lookahead(TensorDictModuleBase):
+class OneByOne(TensorDictModuleBase, ABC):
+    """Choose for one session after the other: the table of all that may follow is large.
+
+    Args:
+        response_model: how the belief thinks the human answers.
+        beam: first questions to follow.
+
+    Raises:
+        InputError: the beam is below 1.
+    """
+
+    in_keys = ["samples", "queries", "action_mask", ("session", "history", "answers")]
+    out_keys = ["action"]
+
+    def __init__(self, response_model: ResponseModel, beam: int) -> None:
+        super().__init__()
+        self.response_model = response_model
+        self.beam = check_count("beam", beam, 1)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action`` (B)."""
+        actions = [self._choose(session) for session in tensordict.select(*self.in_keys).unbind(0)]
+        return tensordict.set("action", torch.stack(actions))
+
+    @abstractmethod
+    def _choose(self, session: TensorDictBase) -> Tensor:
+        """The action () of one session."""
+
+
+class Lookahead(OneByOne):
     """Ask the candidate whose information gain and best successor's sum to most: two steps ahead.
 
     The belief after each answer to the first query is the present one reweighted, so that all
@@ -35,19 +65,8 @@ class Lookahead(TensorDictModuleBase):
         beam: first steps to follow.
     """
 
-    in_keys = ["samples", "queries", "action_mask", ("session", "history", "answers")]
-    out_keys = ["action"]
-
     def __init__(self, response_model: ResponseModel, beam: int = 20) -> None:
-        super().__init__()
-        self.response_model = response_model
-        self.beam = check_count("beam", beam, 1)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``action`` (B)."""
-        # One session at a time: the table of all second steps is large.
-        actions = [self._choose(session) for session in tensordict.select(*self.in_keys).unbind(0)]
-        return tensordict.set("action", torch.stack(actions))
+        super().__init__(response_model, beam)
 
     def _choose(self, session: TensorDictBase) -> Tensor:
         samples = session["samples"].unsqueeze(0)
@@ -70,7 +89,7 @@ class Lookahead(TensorDictModuleBase):
         return first[(value + (of_answer.squeeze(-1) * best).sum(-1)).argmax()]
 
 
-class AlignmentLookahead(TensorDictModuleBase):
+class AlignmentLookahead(OneByOne):
     r"""Ask what leads to the highest expected :math:`\lVert E[\omega] \rVert^2` some questions on.
 
     That is what the belief itself expects of its alignment. After each answer the best next
@@ -87,19 +106,9 @@ class AlignmentLookahead(TensorDictModuleBase):
         InputError: a number is below 1.
     """
 
-    in_keys = ["samples", "queries", "action_mask", ("session", "history", "answers")]
-    out_keys = ["action"]
-
     def __init__(self, response_model: ResponseModel, steps: int = 2, beam: int = 25) -> None:
-        super().__init__()
-        self.response_model = response_model
-        self.steps, self.beam = check_count("steps", steps, 1), check_count("beam", beam, 1)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``action`` (B)."""
-        # One session at a time: the table of all later questions is large.
-        actions = [self._choose(session) for session in tensordict.select(*self.in_keys).unbind(0)]
-        return tensordict.set("action", torch.stack(actions))
+        super().__init__(response_model, beam)
+        self.steps = check_count("steps", steps, 1)
 
     def _choose(self, session: TensorDictBase) -> Tensor:
         samples = session["samples"]

@@ -40,6 +40,7 @@ from torchrl_pref.policies.paper import paper_policy
 from torchrl_pref.questions.responses import Boltzmann
 from torchrl_pref.strategies import RandomAsk
 from torchrl_pref.training.a2c import A2C
+from torchrl_pref.training.sessions import Sessions
 from torchrl_pref.training.settings import TrainingSettings
 from torchrl_pref.training.trainer import Trainer
 
@@ -65,7 +66,7 @@ class Ours:
         env = make_env(n_envs)
         torch.manual_seed(0)
         algorithm = A2C(paper_policy(env), TrainingSettings(**constants))
-        self.trainer = Trainer(env, algorithm, seed=0)
+        self.trainer = Trainer(Sessions(env, algorithm.policy, STEPS), algorithm, seed=0)
 
     def advance(self, updates: int) -> list[int]:
         """Collect and update so often; the lengths of the sessions that ended meanwhile."""

@@ -99,6 +99,7 @@ def settings_of(setup: str = "feed", policy: str = "scorer", **training: Any) ->
             "warm_up": 1,
             "average": 0.9,
             "save_every": 2,
+            "problems": "one",
             **training,
         },
     }

@@ -52,7 +52,7 @@ SECTIONS: dict[str, dict[str, Types]] = {
         **dict.fromkeys(("learning_rate", "gamma", "lmbda", "entropy", "critic"), NUMBER),
         **dict.fromkeys(("grad_norm", "average"), NUMBER),
         "steps": WHOLE + NONE,
-        "optimizer": TEXT,
+        **dict.fromkeys(("optimizer", "problems"), TEXT),
     },
 }
 

@@ -50,6 +50,9 @@ def migrate(settings: Any) -> None:
     # There were no batches.
     if isinstance(settings.get("setup"), dict) and settings["setup"].get("name") == "query":
         settings["setup"].setdefault("batch", 1)
+    # Up to format 7 a training was about one problem.
+    if isinstance(settings.get("training"), dict):
+        settings["training"].setdefault("problems", "one")
     settings.setdefault("question", {"name": "choice"})
     if isinstance(settings.get("belief"), dict):
         settings["belief"] = {"name": "sampled", "lapse": 0.0, **settings["belief"]}

@@ -63,6 +63,7 @@ class SetupSection(TypedDict):
 class TrainingSection(TypedDict):
     """``training``: the constants of every algorithm."""
 
+    problems: str
     updates: int
     sessions: int
     steps: int | None

@@ -78,6 +78,7 @@ TRAINING: dict[str, Check] = {
     "seed": check_seed,
     "logger": check_loggers,
     "evaluation.during": count(0),
+    "training.problems": choice("one", "drawn"),
     "training.updates": count(1),
     "training.sessions": count(1),
     "training.steps": optional(count(1)),

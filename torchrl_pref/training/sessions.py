@@ -10,10 +10,12 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from torchrl_pref.checkpoints.restore import restore_sessions
+from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.objectives import alignment
+from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.policies.base import Policy
 
 
@@ -33,7 +35,7 @@ class Sessions:
             steps (``step_count``) that each has had.
     """
 
-    def __init__(self, env: EnvBase, policy: Policy, steps: int) -> None:
+    def __init__(self, env: QueryEnv | FeedEnv, policy: Policy, steps: int) -> None:
         self.env, self.policy, self.steps = env, policy, steps
         self.strategy = policy.strategy
         self.kept = {*policy.actor.in_keys, *policy.value.in_keys, "logits", "action", "n_asked"}
@@ -42,9 +44,29 @@ class Sessions:
         self.now["step_count"] = torch.zeros_like(self.now["n_asked"])
         self._state_keys = tuple(self.now.keys())
 
+    @property
+    def frames(self) -> int:
+        """B · T, steps in a batch."""
+        return self.now.numel() * self.steps
+
+    @property
+    def generator(self) -> torch.Generator:
+        """Of all luck but that of the actions."""
+        return self.env.generator
+
     def state_dict(self) -> dict[str, Any]:
         """The sessions as they stand, without what the policy wrote beside them."""
         return self.now.select(*self._state_keys).to_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on where :meth:`state_dict` was taken.
+
+        Raises:
+            InputError: the state was taken of other sessions.
+        """
+        session = self.now.select(*self.env.state_spec.keys())
+        sizes = len(self.env.features), self.env.n_answers
+        restore_sessions(self.now, state, session, *sizes)
 
     @torch.no_grad()
     def collect(self) -> TensorDict:

@@ -30,6 +30,8 @@ class TrainingSettings:
         average: share of the old that the moving average of the weights keeps at each update; the
             average is what is saved and evaluated, as it is steadier. 0 averages nothing.
         save_every: updates between two checkpoints.
+        problems: ``one``, that of the run; or ``drawn``: another for each batch, drawn at random,
+            see :mod:`torchrl_pref.training.drawn`.
 
     Raises:
         InputError: a constant is out of range.
@@ -49,8 +51,10 @@ class TrainingSettings:
     warm_up: int
     average: float
     save_every: int
+    problems: str = "one"
 
     def __post_init__(self) -> None:
+        check_choice("training.problems", self.problems, ("one", "drawn"))
         for name in ("updates", "sessions", "save_every"):
             check_count(f"training.{name}", getattr(self, name), 1)
         if self.steps is not None:

@@ -10,6 +10,8 @@ from torchrl_pref.config.sections import Settings
 from torchrl_pref.errors import check_choice, check_seed
 from torchrl_pref.problem import Problem
 from torchrl_pref.training.algorithms import ALGORITHMS
+from torchrl_pref.training.drawn import DrawnSessions
+from torchrl_pref.training.sessions import Sessions
 from torchrl_pref.training.settings import TrainingSettings
 from torchrl_pref.training.trainer import Trainer
 
@@ -27,7 +29,12 @@ def make_trainer(settings: Settings, task: Problem) -> Trainer:
     env = make_training_env(settings, task, task.train, constants.sessions, seed)
     # The policy's initial weights come from the global generator.
     torch.manual_seed(seed)
-    return Trainer(env, learn(make_policy(settings, env), constants, **own), seed)
+    policy = make_policy(settings, env)
+    algorithm = learn(policy, constants, **own)
+    if constants.problems == "drawn":
+        return Trainer(DrawnSessions(settings, policy, env, seed), algorithm, seed)
+    sessions = Sessions(env, policy, constants.steps or env.max_steps)
+    return Trainer(sessions, algorithm, seed)
 
 
 def make_checkpoint(settings: Settings, task: Problem, trainer: Trainer) -> Checkpoint:

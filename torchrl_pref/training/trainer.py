@@ -22,13 +22,13 @@ from tqdm import tqdm
 from torchrl_pref.checkpoints.restore import (
     restore_generator,
     restore_optimizer,
-    restore_sessions,
     restore_weights,
 )
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.policies.base import Policy
 from torchrl_pref.training.actor_critic import ActorCritic
+from torchrl_pref.training.drawn import DrawnSessions
 from torchrl_pref.training.loggers import opened
 from torchrl_pref.training.progress import Progress
 from torchrl_pref.training.sessions import Sessions
@@ -46,14 +46,17 @@ class Trainer:
     """The state of a training run, and the loop.
 
     Args:
-        env: where to learn; its batch size is B.
-        algorithm: how its policy learns.
-        seed: fixes the actions; the environment has its own seed. On the CPU the two fix every bit.
+        sessions: where to learn, see :mod:`torchrl_pref.training.sessions`.
+        algorithm: how the policy that asks in them learns.
+        seed: fixes the actions; the sessions have seeds of their own. On the CPU they fix every
+            bit.
     """
 
-    def __init__(self, env: QueryEnv | FeedEnv, algorithm: ActorCritic, seed: int) -> None:
+    def __init__(
+        self, sessions: Sessions | DrawnSessions, algorithm: ActorCritic, seed: int
+    ) -> None:
         torch.manual_seed(seed)
-        self.env, self.algorithm = env, algorithm
+        self.sessions, self.algorithm = sessions, algorithm
         self.policy: Policy = algorithm.policy
         self.settings: TrainingSettings = algorithm.settings
         self.progress = Progress()
@@ -64,9 +67,11 @@ class Trainer:
             value_network=None,  # the values come with the batch
             vectorized=False,
         )
-        steps = self.settings.steps or env.max_steps
-        self.frames = self.settings.sessions * steps
-        self.sessions = Sessions(env, self.policy, steps)
+
+    @property
+    def env(self) -> QueryEnv | FeedEnv:
+        """Where the policy asks at present."""
+        return self.sessions.env
 
     def run(
         self,
@@ -91,7 +96,7 @@ class Trainer:
         """
         settings, progress = self.settings, self.progress
         bar = tqdm(total=settings.updates, initial=progress.update, desc="training", unit="update")
-        with bar, _stop_request() as stopped, opened(logger, folder, self.frames) as logs:
+        with bar, _stop_request() as stopped, opened(logger, folder, self.sessions.frames) as logs:
             measure()
             logs.start(progress)
             while progress.update < settings.updates and not stopped():
@@ -155,7 +160,7 @@ class Trainer:
             "weights": self.policy.weights.state_dict(),
             "optimizer": self.algorithm.optimizer.state_dict(),
             "sessions": self.sessions.state_dict(),
-            "env_generator": self.env.generator.get_state(),
+            "env_generator": self.sessions.generator.get_state(),
             "global_generator": torch.get_rng_state(),
         }
 
@@ -169,11 +174,8 @@ class Trainer:
         restore_weights(self.policy.weights, state["weights"])
         self.progress = Progress.of(state)
         restore_optimizer(self.algorithm.optimizer, state["optimizer"]["state"])
-        now = self.sessions.now
-        session = now.select(*self.env.state_spec.keys())
-        sizes = len(self.env.features), self.env.n_answers
-        restore_sessions(now, state["sessions"], session, *sizes)
-        restore_generator(self.env.generator, state["env_generator"])
+        self.sessions.load_state_dict(state["sessions"])
+        restore_generator(self.sessions.generator, state["env_generator"])
         restore_generator(torch.default_generator, state["global_generator"])
 
 

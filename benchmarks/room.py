@@ -1,12 +1,16 @@
 """How much room is left above the best closed form: where might a policy learn to ask better?
 
-In each corner of the space of tasks the same humans are asked by greedy information gain, greedy
-expected alignment, both mixed (information early, alignment late), expected alignment judged by
-four times as many samples, and by looking two (of short sessions three) questions ahead at the
-alignment itself. The columns are how much more each is than greedy expected alignment, in the mean
-alignment over all questions. *Room* is that of the one that is best on every other pool, on the
-remaining pools; ± is twice the standard error, and a room of less than that is none. Pools are of
-``task=gaussian``, of seeds that no test uses.
+In each corner of the space of tasks the same humans are asked by information gain, expected
+alignment, both mixed (information early, alignment late), and expected alignment judged by four
+times as many samples. In the query setup the most valuable question is asked, and what looks two
+(of short sessions three) questions ahead at the alignment itself is tried, too. In a feed an offer
+is asked that ranks among the best share, asks left over offers left (a quantile rule); *patient*
+and *eager* multiply that share by .6 and 1.6.
+
+The columns are how much more each is than expected alignment alone, in the mean alignment over all
+questions. *Room* is that of the one that is best on every other pool, on the remaining pools; ± is
+twice the standard error, and a room of less than that is none. Pools are of ``task=gaussian``, of
+seeds that no test uses.
 """
 
 from __future__ import annotations
@@ -17,6 +21,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[0] = str(ROOT)  # and not this folder, whose select.py would hide Python's own
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -31,6 +36,7 @@ from torchrl_pref.acquisition.functions import alignment_gain, information_gain
 from torchrl_pref.acquisition.scoring import score_queries, standardise, together
 from torchrl_pref.beliefs.rationality import RationalityBelief
 from torchrl_pref.beliefs.sampled import Belief, uniform_sphere
+from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.evaluation.run import draw_humans, evaluate
 from torchrl_pref.humans.simulated import SimulatedHuman
@@ -39,15 +45,21 @@ from torchrl_pref.questions import QUESTIONS
 from torchrl_pref.questions.calibrate import calibrate_tau
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.questions.responses import model_of
-from torchrl_pref.strategies import AlignmentLookahead, Greedy
+from torchrl_pref.strategies import AlignmentLookahead, Greedy, QuantileAsk
+from torchrl_pref.strategies.feed import asks_over_offers
 from torchrl_pref.tasks.base import make_pool
 from torchrl_pref.tasks.gaussian import GaussianTask
 
 FIRST_SEED = 900_000
 """Of the pools, far from those of any training or test."""
 
-BASELINE = "alignment"
-TRIED = ("2 ahead", "3 ahead", "mixed", "information", "400 samples")
+BASELINE, FINE = "alignment", "400 samples"
+TRIED = {
+    "query": ("2 ahead", "3 ahead", "mixed", "information", "400 samples"),
+    "feed": ("mixed", "information", "400 samples", "patient", "eager"),
+}
+PATIENT, EAGER = 0.6, 1.6
+"""How a quantile rule's share is multiplied."""
 
 SHORT = 5
 """Questions up to which three steps ahead are looked at, too."""
@@ -65,6 +77,7 @@ class Corner:
         budget: H.
         question: what can be answered.
         unknown: whether the belief has to infer tau, of humans whose tau is within a factor of 4.
+        offers: of a feed, for each ask.
     """
 
     dimension: int = 4
@@ -75,6 +88,7 @@ class Corner:
     budget: int = 10
     question: str = "choice"
     unknown: bool = False
+    offers: float = 5.0
 
 
 CORNERS: dict[str, dict[str, Any]] = {
@@ -101,6 +115,15 @@ CORNERS: dict[str, dict[str, Any]] = {
     "tau unknown": {"unknown": True},
 }
 """The first, and what is different in the others."""
+
+OF_FEEDS: dict[str, dict[str, Any]] = {
+    "1.5 offers an ask": {"offers": 1.5},
+    "15 offers an ask": {"offers": 15.0},
+    "1.5 offers an ask, 70%": {"offers": 1.5, "accuracy": 0.7},
+    "never err, H=20": {"accuracy": 1.0, "budget": 20},
+    "isotropic, H=20": {"skew": 1.0, "budget": 20},
+}
+"""More of them in a feed."""
 
 
 class Mixed(TensorDictModuleBase):
@@ -134,17 +157,49 @@ class Found:
         return float((own - base).mean()), 2 * float((own - base).std()) / len(base) ** 0.5
 
 
-def strategies_of(model: ResponseModel, budget: int) -> dict[str, TensorDictModuleBase]:
-    """What is tried, but for what needs other samples."""
-    tried: dict[str, TensorDictModuleBase] = {
-        BASELINE: Greedy(model, alignment_gain),
-        "information": Greedy(model),
-        "mixed": Mixed(model),
-        "2 ahead": AlignmentLookahead(model, 2),
+class Scaled(QuantileAsk):
+    """The quantile rule of expected alignment, of a share that is multiplied."""
+
+    def __init__(self, env: FeedEnv, factor: float) -> None:
+        super().__init__(env, alignment_gain)
+        self.factor = factor
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action`` (B)."""
+        samples, offer, n_asked, n_offered = (tensordict[key] for key in self.in_keys)
+        rank = self.rank(samples, offer, 1 - n_asked / self.budget)
+        share = asks_over_offers(n_asked, n_offered, self.budget, self.n_offers)
+        ask = (rank >= 1 - self.factor * share) | (share >= 1)
+        return tensordict.set("action", ask.squeeze(-1).long())
+
+
+Tried = dict[str, Callable[[Any], TensorDictModuleBase]]
+"""By name, from an environment to a strategy."""
+
+
+def tried_in_pools(budget: int) -> Tried:
+    """What is tried in the query setup."""
+    tried: Tried = {
+        BASELINE: lambda env: Greedy(env.belief.response_model, alignment_gain),
+        "information": lambda env: Greedy(env.belief.response_model),
+        "mixed": lambda env: Mixed(env.belief.response_model),
+        "2 ahead": lambda env: AlignmentLookahead(env.belief.response_model, 2),
     }
     if budget <= SHORT:
-        tried["3 ahead"] = AlignmentLookahead(model, 3)
-    return tried
+        tried["3 ahead"] = lambda env: AlignmentLookahead(env.belief.response_model, 3)
+    return {**tried, FINE: tried[BASELINE]}
+
+
+def tried_in_feeds() -> Tried:
+    """What is tried in a feed."""
+    tried: Tried = {
+        BASELINE: lambda env: QuantileAsk(env, alignment_gain),
+        "information": QuantileAsk,
+        "mixed": lambda env: QuantileAsk(env, information_gain, late=alignment_gain),
+        "patient": lambda env: Scaled(env, PATIENT),
+        "eager": lambda env: Scaled(env, EAGER),
+    }
+    return {**tried, FINE: tried[BASELINE]}
 
 
 def normalised(corner: Corner, number: int) -> QueryPool:
@@ -162,27 +217,30 @@ def model_for(corner: Corner, pool: QueryPool) -> ResponseModel:
     return model_of(tau, QUESTIONS[corner.question](), lapse=0.0)
 
 
-def measure(corner: Corner, pools: int, humans: int) -> Found:
+def measure(corner: Corner, setup: str, pools: int, humans: int) -> Found:
     """All strategies on all pools, each with the same humans."""
     found = Found()
+    tried = tried_in_feeds() if setup == "feed" else tried_in_pools(corner.budget)
     for number in range(pools):
         pool = normalised(corner, number)
         model = model_for(corner, pool)
-        spread = 4.0 if corner.unknown else 1.0
-        make = RationalityBelief if corner.unknown else Belief
-        tried = strategies_of(model, corner.budget)
-        for name, strategy in {**tried, "400 samples": tried[BASELINE]}.items():
-            belief = make(model, samples=400 if name == "400 samples" else 100)
-            human = SimulatedHuman(model, spread)
-            env = QueryEnv(
-                pool, human, belief, corner.budget, batch_size=(humans,), seed=FIRST_SEED + number
-            )
-            done = evaluate(env, strategy, draw_humans(env))
+        human = SimulatedHuman(model, 4.0 if corner.unknown else 1.0)
+        common = {"budget": corner.budget, "batch_size": (humans,), "seed": FIRST_SEED + number}
+        for name, make_strategy in tried.items():
+            samples = 400 if name == FINE else 100
+            belief = (RationalityBelief if corner.unknown else Belief)(model, samples=samples)
+            env: QueryEnv | FeedEnv
+            if setup == "feed":
+                offers = round(corner.offers * corner.budget)
+                env = FeedEnv(pool, human, belief, offers=offers, skip="free", **common)
+            else:
+                env = QueryEnv(pool, human, belief, **common)
+            done = evaluate(env, make_strategy(env), draw_humans(env))
             found.curves.setdefault(name, []).append(done.alignment[:, 1:])
     return found
 
 
-def row_of(name: str, corner: Corner, found: Found) -> common.Row:
+def row_of(name: str, setup: str, found: Found) -> common.Row:
     """What is told of a corner."""
     best = max(found.curves, key=lambda each: found.more(each, slice(0, None, 2))[0])
     room, error = found.more(best, slice(1, None, 2))
@@ -190,8 +248,8 @@ def row_of(name: str, corner: Corner, found: Found) -> common.Row:
     return {
         "corner": name,
         "alignment": float(torch.cat(found.curves[BASELINE]).mean()),
-        **{each: told.get(each, "") for each in TRIED},
-        "±": found.more("2 ahead")[1],
+        **{each: told.get(each, "") for each in TRIED[setup]},
+        "±": found.more("mixed")[1],
         "room": f"{room:+.3f} ± {error:.3f}" if room > error else "none seen",
         "by": best if room > error else "",
     }
@@ -202,18 +260,21 @@ def main() -> None:
     parser = common.arguments(__doc__)
     parser.add_argument("--pools", type=int, default=8, help="in each corner (default 8)")
     parser.add_argument("--humans", type=int, default=125, help="of each pool (default 125)")
+    parser.add_argument("--setup", default="query", choices=list(TRIED), help="(default query)")
     parser.add_argument("--only", help="corners, by semicolons")
     typed = common.start(parser)
     if typed.pools < 2:
         parser.error("--pools: expected at least 2, to choose on some and to judge on others")
-    names = typed.only.split(";") if typed.only else list(CORNERS)
-    if unknown := [name for name in names if name not in CORNERS]:
-        parser.error(f"--only {unknown[0]}: expected some of {'; '.join(CORNERS)}")
+    corners = {**CORNERS, **OF_FEEDS} if typed.setup == "feed" else CORNERS
+    names = typed.only.split(";") if typed.only else list(corners)
+    if unknown := [name for name in names if name not in corners]:
+        parser.error(f"--only {unknown[0]}: expected some of {'; '.join(corners)}")
     rows = []
     for name in tqdm(names, desc="corners"):
-        corner = replace(Corner(), **CORNERS[name])
-        rows.append(row_of(name, corner, measure(corner, typed.pools, typed.humans)))
-    title = "Mean alignment over all questions: greedy expected alignment, and what others are more"
+        corner = replace(Corner(), **corners[name])
+        found = measure(corner, typed.setup, typed.pools, typed.humans)
+        rows.append(row_of(name, typed.setup, found))
+    title = "Mean alignment over all questions: expected alignment, and what others are more"
     common.report(title, rows, typed.json)
 
 

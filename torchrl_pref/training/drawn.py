@@ -112,7 +112,8 @@ def draw_problem(settings: Settings, luck: Generator) -> Settings:
     drawn = {
         "task": task,
         "question": {"name": question, **({"threshold": 1.0} if question == "weak" else {})},
-        "tau": "optimal" if kind < NEVER_ERR else tau,
+        # To somebody who never errs nothing is about equal.
+        "tau": "optimal" if kind < NEVER_ERR and question != "weak" else tau,
         "pool": {
             **settings["pool"],
             "size": size,

@@ -15,12 +15,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import hydra
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 import app
 import typed
+from help_text import CONF
 from torchrl_pref import runs
-from torchrl_pref.config.sections import Plain, Settings
+from torchrl_pref.config.sections import GroupSection, Plain, Settings
 from torchrl_pref.config.settings import check_evaluate_settings
 from torchrl_pref.errors import InputError, one_line_errors
 from torchrl_pref.runs import CHECKPOINT
@@ -44,6 +45,7 @@ PROTOCOL_KEYS = (
     "belief.",
     "task",
     "task.",
+    "tasks",
     "pool.size",
     "pool.options",
     "pool.seed",
@@ -93,6 +95,8 @@ def check(settings: Plain) -> Settings:
             "objective=… is what a policy is trained for and changes nothing here; "
             "expected by train.py alone; remove it"
         )
+    if settings.get("tasks") is not None:
+        refuse_one_task(settings)
     if settings.get("protocol") is not None:
         typed.refuse_other_overrides("protocol", PROTOCOL_KEYS)
     elif settings.get("checkpoint") is not None:
@@ -113,7 +117,8 @@ def check(settings: Plain) -> Settings:
             "trained; add checkpoint=<its run folder>, or name a strategy by strategy="
         )
     checked = check_evaluate_settings(settings)
-    app.check_groups(settings)
+    for each in tasks_of(checked):
+        app.check_groups({**each})
     own_strategies(checked)
     return checked
 
@@ -176,11 +181,11 @@ def evaluate_taus(
 
 
 def pretrained_for(settings: Settings, tau: Any) -> dict[str, Checkpoint]:
-    """The policy that comes with the package for a tau, under the settings of this evaluation."""
+    """The policy that comes with the package, under the settings of this evaluation."""
     from torchrl_pref.evaluation.comparison import policy_key
     from torchrl_pref.pretrained import pretrained_checkpoint
 
-    checkpoint = pretrained_checkpoint(settings["setup"]["name"], tau)
+    checkpoint = pretrained_checkpoint(settings["setup"]["name"])
     taken = {key: value for key, value in settings.items() if key in OF_EVALUATION}
     checkpoint = replace(checkpoint, settings=cast(Settings, {**checkpoint.settings, **taken}))
     return {f"{policy_key(checkpoint.settings)}:pretrained": checkpoint}
@@ -193,20 +198,52 @@ def run_heldout(settings: Settings) -> Records:
     from torchrl_pref.evaluation.heldout_pool import Cell
     from torchrl_pref.pretrained import SEEDS, pretrained_checkpoint
 
-    learned: dict[Cell, list[Checkpoint]] = {}
+    checkpoints: list[Checkpoint] = []
     if settings["checkpoint"] is None:
-        for setup, tau in product(("query", "feed"), ("noisy", "optimal")):
-            learned[Cell(setup, tau)] = [
-                pretrained_checkpoint(setup, tau, seed) for seed in range(SEEDS)
-            ]
+        for setup, seed in product(("query", "feed"), range(SEEDS)):
+            checkpoints.append(pretrained_checkpoint(setup, seed=seed))
     else:
-        for path in find_checkpoints([str(name) for name in listed(settings["checkpoint"])]):
-            checkpoint = Checkpoint.load(path)
-            cell = Cell(checkpoint.settings["setup"]["name"], checkpoint.settings["tau"])
-            learned.setdefault(cell, []).append(checkpoint)
+        paths = find_checkpoints([str(name) for name in listed(settings["checkpoint"])])
+        checkpoints = [Checkpoint.load(path) for path in paths]
+    learned: dict[Cell, list[Checkpoint]] = {}
+    for checkpoint in checkpoints:
+        own = checkpoint.settings["tau"]
+        for tau in ("noisy", "optimal") if checkpoint.of_every_task else (own,):
+            learned.setdefault(Cell(checkpoint.settings["setup"]["name"], tau), []).append(
+                checkpoint
+            )
     return heldout.run_protocol(
-        settings, learned, settings["workers"], list(own_strategies(settings))
+        tasks_of(settings), learned, settings["workers"], list(own_strategies(settings))
     )
+
+
+def refuse_one_task(settings: Plain) -> None:
+    """Refuse several tasks where only one is looked at.
+
+    Raises:
+        InputError: ``tasks`` was typed without the protocol, or beside a task or pools.
+    """
+    if settings.get("protocol") is None:
+        raise InputError(
+            f"tasks={settings['tasks']} without protocol=heldout: expected task=<name>, one; or "
+            "add protocol=heldout"
+        )
+    for key in ("task", "pool.train", "pool.test"):
+        if typed.was_typed(key):
+            raise InputError(
+                f"{key}= beside tasks=: each of the tasks has pools of its own; remove {key}, or "
+                "tasks"
+            )
+
+
+def tasks_of(settings: Settings) -> list[Settings]:
+    """The settings for each task of the protocol: those named, or the one that was typed."""
+    named = settings["tasks"]
+    if named is None:
+        return [settings]
+    sections = [OmegaConf.load(CONF / "task" / f"{name}.yaml") for name in listed(named)]
+    plain = [cast(GroupSection, OmegaConf.to_container(section)) for section in sections]
+    return [{**settings, "task": section} for section in plain]
 
 
 def find_checkpoints(named: list[str]) -> list[Path]:

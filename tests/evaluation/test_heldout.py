@@ -173,11 +173,11 @@ def test_policies_of_other_tasks_are_refused() -> None:
     settings = settings_of("query")
     paper = checkpoint_of(settings_of("query", policy="paper"))
     with pytest.raises(InputError, match="indices of its training pool"):
-        run_protocol(settings, {Cell("query", "noisy"): [paper]}, 1)
+        run_protocol([settings], {Cell("query", "noisy"): [paper]}, 1)
     other = checkpoint_of(settings)
     other.settings["setup"]["budget"] = 9
     with pytest.raises(InputError, match=r"setup\.budget=9"):
-        run_protocol(settings_of("query"), {Cell("query", "noisy"): [other]}, 1)
+        run_protocol([settings_of("query")], {Cell("query", "noisy"): [other]}, 1)
 
 
 def test_normaliser_is_that_of_the_training_pool() -> None:
@@ -227,7 +227,7 @@ def test_whole_protocol(monkeypatch: pytest.MonkeyPatch) -> None:
     learned = {}
     for setup in ("query", "feed"):
         learned[Cell(setup, "noisy")] = [checkpoint_of({**settings_of(setup), "seed": 3})]
-    records = run_protocol(settings_of("feed"), learned, 1)
+    records = run_protocol([settings_of("feed")], learned, 1)
     assert records.tasks == ["query/noisy/corners", "query/noisy/balanced", "feed/noisy/corners"]
     fit = Job(settings_of("feed"), Cell("feed", "noisy"), 0, thresholds=(0.1, 9.0))
     best = (0.1, 9.0)[int(fit_threshold(fit).argmax())]

@@ -183,7 +183,7 @@ def test_the_protocol_runs_on_pools_of_the_user(tmp_path: Path) -> None:
     small = {**settings, "pool": settings["pool"] | {"test": str(tmp_path / "five.pt")}}
     QueryPool(torch.randn(25, 3, 5)).save(tmp_path / "five.pt")
     with pytest.raises(InputError, match="D=5"):
-        run_protocol(small, learned, 1)
+        run_protocol([small], learned, 1)
 
 
 @pytest.mark.parametrize("kind", [QueryEnv, FeedEnv])

@@ -72,6 +72,12 @@ class Checkpoint:
         """Whether the policy picks an index of its training pool, as the paper's query policy."""
         return picks_by_index(self.settings)
 
+    @property
+    def of_every_task(self) -> bool:
+        """Whether the policy was trained over many problems, and is bound to no task, tau, kind of
+        question or budget."""
+        return self.settings["training"]["problems"] == "drawn"
+
     def save(self, path: str | Path) -> None:
         """Write the checkpoint, whole or not at all."""
         save_atomically({"kind": KIND, "format": FORMAT, **asdict(self)}, path)

@@ -106,6 +106,7 @@ class Settings(TypedDict):
     resume: NotRequired[str | None]
     # Of evaluate.py.
     protocol: NotRequired[str | None]
+    tasks: NotRequired[str | list[str] | None]
     workers: NotRequired[int]
     strategy: NotRequired[str | list[str] | None]
     # Of both: a file to start from, or those to compare.

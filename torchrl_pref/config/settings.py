@@ -34,7 +34,12 @@ from torchrl_pref.config.checks import (
 )
 from torchrl_pref.config.memory import check_memory
 from torchrl_pref.config.sections import Plain, Settings
-from torchrl_pref.config.together import check_together, refuse_batches, refuse_lookahead
+from torchrl_pref.config.together import (
+    check_drawn,
+    check_together,
+    refuse_batches,
+    refuse_lookahead,
+)
 from torchrl_pref.errors import (
     InputError,
     check_choice,
@@ -99,9 +104,13 @@ TRAINING: dict[str, Check] = {
 TRAIN_DOOR: dict[str, Check] = {"resume": optional(check_path), "checkpoint": optional(check_path)}
 """Of train.py, and not of the run that it starts."""
 
+PROTOCOL_TASKS = ("gridworld", "driver", "lds", "gymnasium", "gaussian")
+"""Tasks that need no settings of their own."""
+
 EVALUATE: dict[str, Check] = {
     "tau": one_or_more(check_tau),
     "protocol": optional(choice("heldout")),
+    "tasks": optional(one_or_more(choice(*PROTOCOL_TASKS))),
     "workers": count(1, LARGEST_THREADS),
     "checkpoint": optional(one_or_more(check_path)),
     "strategy": optional(one_or_more(strategy(*STRATEGIES, *ONLY_QUERY))),
@@ -201,6 +210,7 @@ def check_run(settings: Plain) -> Settings:
     check_keys(own, TASK | TRAINING, OF_TRAINING)
     refuse_batches(own, "a policy that is learned")
     check_together(own)
+    check_drawn(own)
     setup, policy = own["setup"], own["policy"]
     if setup["name"] == "feed" and policy.get("start") is not None:
         raise InputError(
@@ -230,13 +240,12 @@ def check_evaluate_settings(settings: Plain) -> Settings:
             refuse_batches(settings, f"strategy={name}")
         refuse_lookahead(settings["setup"]["name"], name)
     check_together(settings)
-    if "policy" in settings:
-        one_or_more(choice("noisy", "optimal"))("tau", settings["tau"])
-        if settings["setup"]["name"] == "feed" and settings["skip"] != "free":
-            raise InputError(
-                f"policy=pretrained with skip={settings['skip']}: the pretrained feed policies "
-                "were trained with free skips and a budget of asks; expected skip=free; remove skip"
-            )
+    in_feed = "policy" in settings and settings["setup"]["name"] == "feed"
+    if in_feed and settings["skip"] != "free":
+        raise InputError(
+            f"policy=pretrained with skip={settings['skip']}: the pretrained feed policies were "
+            "trained with free skips and a budget of asks; expected skip=free; remove skip"
+        )
     checked = cast(Settings, settings)
     check_memory(checked)
     return checked

@@ -12,6 +12,9 @@ from torchrl_pref.errors import InputError, check_batch, check_count
 OF_ONE = ("approve", "own")
 """Kinds of question that may be about one option."""
 
+OF_ONE_DIMENSION = ("attention", "paper")
+"""Policies whose weights are for one number of features."""
+
 LARGEST_RATE = 4.0
 """Of the lapse rates that are thought possible, in units of their mean, see ``beliefs.lapses``."""
 
@@ -73,6 +76,34 @@ def refuse_batches(settings: Plain, who: str) -> None:
         raise InputError(
             f"setup.batch={batch}: {who} chooses one query at a time; set setup.batch=1, or "
             "compare batches by evaluate.py setup=query"
+        )
+
+
+def check_drawn(settings: Plain) -> None:
+    """Refuse what a training over many problems cannot be made with.
+
+    Raises:
+        InputError: the policy is bound to one number of features, batches are no whole sessions, or
+            pools of the user's are named.
+    """
+    policy, pool = settings["policy"]["name"], settings["pool"]
+    if settings["training"]["problems"] != "drawn":
+        return
+    if policy in OF_ONE_DIMENSION:
+        raise InputError(
+            f"training.problems=drawn with policy={policy}: problems differ in their number of "
+            "features, and this policy has weights for each; type policy=scorer"
+        )
+    if settings["training"]["steps"] is not None:
+        raise InputError(
+            f"training.problems=drawn with training.steps={settings['training']['steps']}: each "
+            "update is about another problem, from the first question to the last; leave "
+            "training.steps out"
+        )
+    if pool["train"] is not None:
+        raise InputError(
+            f"training.problems=drawn with pool.train={pool['train']}: each update draws a pool of "
+            "its own; remove the pools, or type training.problems=one"
         )
 
 

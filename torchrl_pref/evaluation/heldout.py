@@ -37,19 +37,19 @@ POOLS, BALANCED_POOLS = 10, 3
 
 
 def run_protocol(
-    settings: Settings,
+    tasks: Sequence[Settings],
     learned: Mapping[Cell, Sequence[Checkpoint]],
     workers: int,
     own: Sequence[str] = (),
 ) -> Records:
-    """Run all cells for which there are policies.
+    """Run all cells for which there are policies, on each task.
 
     Of a task there are ten pools that no training used. On a pool of the user's
     (``pool.train`` and ``pool.test``) ten groups of humans face the test pool, all of it: intervals
     are over groups, and tell of other humans on that pool and not of other pools.
 
     Args:
-        settings: the sections ``task``, ``pool``, ``belief``, ``setup`` and ``device``.
+        tasks: for each the sections ``task``, ``pool``, ``belief``, ``setup`` and ``device``.
         learned: the policies of each cell, of any kinds and training seeds.
         workers: processes that run pools side by side, one CPU thread each.
         own: strategies of the user, ``module:name`` of each; they face every cell.
@@ -58,7 +58,7 @@ def run_protocol(
         InputError: a policy was trained for another budget or cannot face the same offers as the
             others, or a strategy of the user cannot decide.
     """
-    jobs = _jobs(settings, learned, own)
+    jobs = [job for settings in tasks for job in _jobs(settings, learned, own)]
     for job in jobs:
         if job.pool == 0:
             try_job(job)
@@ -183,12 +183,6 @@ def _check_fits(settings: Settings, cell: Cell, checkpoint: Checkpoint, first: C
                 f"{plain[group].get('make')}, which is yours; expected runs of what "
                 "is in the package; evaluate yours by checkpoint= without protocol="
             )
-    if checkpoint.settings["question"] != settings["question"]:
-        raise InputError(
-            f"protocol=heldout asks {settings['question']['name']} questions and the policy was "
-            f"trained for {checkpoint.settings['question']['name']}; evaluate it by checkpoint= "
-            "without protocol="
-        )
     if checkpoint.picks_by_index:
         raise InputError(
             "protocol=heldout: policy=paper in the query setup picks indices of its training pool, "
@@ -199,6 +193,19 @@ def _check_fits(settings: Settings, cell: Cell, checkpoint: Checkpoint, first: C
         raise InputError(
             f"protocol=heldout: policies of a feed cell differ in skip: {mine} and {theirs}; "
             "expected policies that can be offered the same; give one kind at a time"
+        )
+    _check_trained_for(settings, cell, checkpoint)
+
+
+def _check_trained_for(settings: Settings, cell: Cell, checkpoint: Checkpoint) -> None:
+    """Refuse a policy of another kind of question or another budget, unless it is for all."""
+    if checkpoint.of_every_task:
+        return
+    if checkpoint.settings["question"] != settings["question"]:
+        raise InputError(
+            f"protocol=heldout asks {settings['question']['name']} questions and the policy was "
+            f"trained for {checkpoint.settings['question']['name']}; evaluate it by checkpoint= "
+            "without protocol="
         )
     found, budget = checkpoint.settings["setup"]["budget"], settings["setup"]["budget"]
     if found != budget:

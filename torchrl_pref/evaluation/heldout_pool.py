@@ -134,7 +134,7 @@ def run_pool(job: Job) -> list[Entry]:
     torch.manual_seed(seed)  # of policies that draw their actions
     exam = make_exam(job.settings, task, pool)
     results = run_side_by_side(make_env, humans, lineup, exam)
-    if job.cell.setup == "query" and job.cell.features != "balanced":
+    if job.cell.setup == "query" and job.cell.features == "corners":
         greedy = Greedy(task.response_model)
         if len(pool) >= env.budget:
             setup = {**job.settings["setup"], "repeats": False}
@@ -229,6 +229,7 @@ def _baselines(
     }
     if job.cell.features != "balanced":
         strategies["volume_removal"] = Greedy(model, volume_removal)
+    if job.cell.features == "corners":
         strategies["lookahead"] = Lookahead(model)
     return strategies
 

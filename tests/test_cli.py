@@ -196,8 +196,8 @@ def test_evaluate_compares_the_baselines(tmp_path: Path) -> None:
 @pytest.mark.parametrize("example", sorted((ROOT / "examples").glob("*.py")), ids=lambda p: p.stem)
 def test_examples_run(example: Path, tmp_path: Path) -> None:
     assert len(example.read_text().splitlines()) < 50
-    argument = str(tmp_path) if example.stem == "drive_by_reward" else "2"
-    assert run(str(example.relative_to(ROOT)), argument)
+    typed = {"drive_by_reward": [tmp_path], "pendulum_file": [tmp_path / "trips.csv", 20]}
+    assert run(str(example.relative_to(ROOT)), *map(str, typed.get(example.stem, [2])))
 
 
 def keys_of(config: DictConfig) -> set[str]:

@@ -1,5 +1,7 @@
 """What every acquisition function keeps to: the package's, and one written outside of it."""
 
+import math
+
 import my_acquisition
 import pytest
 import torch
@@ -8,12 +10,15 @@ from torch import Generator
 from torchrl_pref.acquisition import ACQUISITIONS
 from torchrl_pref.acquisition.functions import (
     Acquisition,
+    information_gain,
     least_confidence,
     volume_removal,
 )
 from torchrl_pref.acquisition.knowledge_gradient import KnowledgeGradient
+from torchrl_pref.acquisition.per_second import Cost, PerSecond
 from torchrl_pref.acquisition.scoring import score_in_tensors, score_queries
 from torchrl_pref.beliefs.sampled import uniform_sphere
+from torchrl_pref.errors import InputError
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.questions.responses import Boltzmann, Optimal
 from torchrl_pref.questions.weak import Weak
@@ -66,3 +71,20 @@ def test_options_that_are_alike_are_worth_nothing(
         else:
             assert torch.allclose(found, torch.tensor(1 - 1 / n_options))
             assert (score_queries(samples, queries, model, function) <= found + 1e-6).all()
+
+
+def test_a_question_takes_longer_where_the_person_is_undecided(generator: Generator) -> None:
+    """Gains by a loop over samples and options, divided by seconds that are counted by hand."""
+    samples = uniform_sphere((1, 30, 4), generator)
+    queries = torch.randn(1, 5, 3, 4, generator=generator)
+    found = score_queries(
+        samples, queries, Boltzmann(2.0), PerSecond(information_gain, Cost(watch=6, decide=3))
+    )
+    for query, value in zip(queries[0], found[0], strict=True):
+        answers = [torch.softmax(2.0 * query @ omega, 0) for omega in samples[0]]
+        hard = sum(float(torch.special.entr(each).sum()) for each in answers) / len(answers)
+        mean = torch.stack(answers).mean(0)
+        bits = (float(torch.special.entr(mean).sum()) - hard) / math.log(2)
+        assert float(value) == pytest.approx(bits / (6 + 3 * (1 + hard / math.log(3))), abs=1e-5)
+    with pytest.raises(InputError, match="watch=0: expected a finite number above 0"):
+        Cost(watch=0)

@@ -8,6 +8,7 @@ from torchrl_pref.acquisition.functions import (
     volume_removal,
 )
 from torchrl_pref.acquisition.pairs import disagreement, max_regret
+from torchrl_pref.acquisition.per_second import PerSecond
 
 ACQUISITIONS: dict[str, Acquisition] = {
     "information_gain": information_gain,
@@ -16,6 +17,8 @@ ACQUISITIONS: dict[str, Acquisition] = {
     "max_regret": max_regret,
     "disagreement": disagreement,
     "least_confidence": least_confidence,
+    "information_per_second": PerSecond(information_gain),
+    "alignment_per_second": PerSecond(alignment_gain),
 }
 """The acquisition functions by name. A :class:`KnowledgeGradient` is made of a pool, and so no line
 here."""

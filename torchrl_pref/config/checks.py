@@ -36,6 +36,8 @@ STRATEGIES = (
     "thompson",
     "least_confidence",
     "knowledge_gradient",
+    "information_per_second",
+    "alignment_per_second",
 )
 """Those that either setup knows by name, beside ``random`` (docs/strategies.md)."""
 

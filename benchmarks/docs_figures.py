@@ -28,7 +28,6 @@ import shlex
 import shutil
 import subprocess
 from collections.abc import Callable, Iterator
-from itertools import chain
 from typing import Any, NamedTuple
 
 from tabulate import tabulate
@@ -226,49 +225,54 @@ def objectives(folder: Path) -> dict[str, str]:
 
 
 def tasks(folder: Path) -> dict[str, str]:
-    """Strategies on the literature's tasks, beside a policy that was trained there and ours."""
+    """All strategies on the literature's tasks, and the policy for every task beside the two rules
+    that it has to be as good as, on all tasks that no training saw."""
+    found = [read_records(path) for path in sorted(folder.glob(f"*/{CSV}"))]
+    cells = {cell: records.of_task(cell) for records in found for cell in records.tasks}
     tables = {}
-    for task in OTHER_TASKS:
-        records = read_records(folder / f"{task}-heldout" / CSV)
-        for cell in records.tasks:
-            own, rows = records.of_task(cell), []
-            for key in own.strategies:
-                values, gap = alignment(own, key), difference(own, key, "greedy_information")
-                name = name_of(key)
-                if is_judged(key):
-                    ours = "task.name=gridworld" in key
-                    name = (
-                        "RL of the package, made for the Gridworld" if ours else "RL trained on it"
-                    )
-                elif values.shape[2] < alignment(own, own.strategies[0]).shape[2]:
-                    continue  # many samples: on a few humans
-                row = {"strategy": name}
-                row |= {f"after {j}": f"{values[..., j].mean():.3f}" for j in milestones(20)}
-                row["mean of 1 to 20"] = f"{values[..., 1:].mean():.3f}"
-                information = key == "greedy_information"
-                row["minus greedy information gain, mean"] = (
-                    "" if information else interval(gap[..., 1:].mean(-1))
-                )
-                rows.append(row)
-            tables[f"tasks-{cell.replace('/', '-')}"] = table(rows)
-    return tables
+    for cell in (f"query/{tau}/{task}" for task in ("driver", "lds") for tau in TAUS):
+        rows = []
+        for key in cells[cell].strategies:
+            values, gap = (
+                alignment(cells[cell], key),
+                difference(cells[cell], key, "greedy_information"),
+            )
+            row = {"strategy": name_of(key)}
+            row |= {f"after {j}": f"{values[..., j].mean():.3f}" for j in milestones(20)}
+            row["mean of 1 to 20"] = f"{values[..., 1:].mean():.3f}"
+            row["minus greedy information gain, mean"] = (
+                "" if key == "greedy_information" else interval(gap[..., 1:].mean(-1))
+            )
+            rows.append(row)
+        tables[f"tasks-{cell.replace('/', '-')}"] = table(rows)
+    order = sorted(cells, key=lambda cell: (cell.split("/")[0] == "feed", cell.split("/")[2]))
+    return {**tables, "every-task": table([every_row(cell, cells[cell]) for cell in order])}
 
 
-def on_task(task: str) -> Iterator[str]:
-    """Two trainings on a task, and the held-out protocol there."""
-    for tau in ("noisy", "optimal"):
-        run = f"{{folder}}/{task}-{tau}"
-        line = f"python train.py task={task} setup=query tau={tau} hydra.run.dir={run}"
-        yield f"{line} -> {task}-{tau}/tables.txt"
-    trained = [f"{{folder}}/{task}-{tau}" for tau in ("noisy", "optimal")]
-    ours = [f"torchrl_pref/policies/weights/query-{tau}-0.pt" for tau in ("noisy", "optimal")]
-    line = (
-        f"python evaluate.py protocol=heldout task={task} checkpoint=[{','.join(trained + ours)}]"
-    )
-    yield f"{line} hydra.run.dir={{folder}}/{task}-heldout -> {task}-heldout/{CSV}"
+def every_row(cell: str, records: Records) -> dict[str, str]:
+    """The policy beside both rules in one cell, in the mean over the questions."""
+    setup, tau, task = cell.split("/")
+    policy = next(key for key in records.strategies if is_judged(key))
+    rule = "quantile" if setup == "feed" else "greedy"
+    information, rule_alignment = f"{rule}_information", f"{rule}_alignment"
+
+    def gap(first: str, second: str) -> str:
+        return interval(difference(records, first, second)[..., 1:].mean(-1))
+
+    return {
+        "setup, human": f"{setup}, {tau}",
+        "task": task,
+        "by information": f"{alignment(records, information)[..., 1:].mean():.3f}",
+        "alignment − information": gap(rule_alignment, information),
+        "RL − information": gap(policy, information),
+        "RL − alignment": gap(policy, rule_alignment),
+    }
 
 
-OTHER_TASKS = ("driver", "lds")
+TAUS = ("noisy", "optimal")
+HELDOUT = "python evaluate.py protocol=heldout"
+FAR = "task=gaussian task.dimension=24 task.skew=3000"
+"""More features, and more alike, than any training saw."""
 
 TRAIN, EVALUATE = "python train.py setup=query tau=noisy", "evaluation.humans=300"
 
@@ -333,7 +337,18 @@ PARTS: dict[str, Part] = {
         80,
         objectives,
     ),
-    "tasks": Part("docs/results.md", tuple(chain(*(map(on_task, OTHER_TASKS)))), 20, tasks),
+    "tasks": Part(
+        "docs/results.md",
+        (
+            f"{HELDOUT} tasks=[driver,lds,gymnasium] hydra.run.dir={{folder}}/tasks -> tasks/{CSV}",
+            f"{HELDOUT} {FAR} hydra.run.dir={{folder}}/gaussian -> gaussian/{CSV}",
+            "python examples/pendulum_file.py {folder}/pendulum.csv 2000 -> pendulum.csv",
+            f"{HELDOUT} task=files task.path={{folder}}/pendulum.csv "
+            f"hydra.run.dir={{folder}}/files -> files/{CSV}",
+        ),
+        40,
+        tasks,
+    ),
     "batches": measured("batches", "docs/batches.md", 20),
     "answers": measured("answers", "docs/questions.md", 3, "--plot {folder}/answers.png"),
     "quality": Part(

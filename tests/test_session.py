@@ -362,6 +362,21 @@ def test_a_question_of_a_feed_that_is_only_looked_at_does_not_go_by() -> None:
     assert session.to_dict() == looked.to_dict() == restored.to_dict()
 
 
+def test_what_counts_the_offers_sees_one_after_the_other() -> None:
+    class EveryThird(TensorDictModuleBase):
+        in_keys, out_keys, seen = ["offer"], ["action"], 0
+
+        def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+            self.seen += 1
+            return tensordict.set("action", torch.tensor([int(self.seen % 3 == 0)]))
+
+    session = Session(gridworld_pool(50), MODEL, lambda env: EveryThird(), setup="feed", seed=3)
+    for answered in range(4):
+        session.ask()
+        assert session.n_offered == 3 * (answered + 1)
+        session.tell(0)
+
+
 def test_a_feed_ends_with_its_offers() -> None:
     class Never(TensorDictModuleBase):
         in_keys, out_keys = ["offer"], ["action"]

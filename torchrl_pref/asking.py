@@ -6,9 +6,10 @@ Shapes: B people, N queries in the pool, K options per query, D features, O offe
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import Generator, Tensor
 from torchrl.envs import EnvBase
@@ -22,6 +23,9 @@ from torchrl_pref.errors import InputError, check_choice, check_type
 from torchrl_pref.humans.simulated import SimulatedHuman
 from torchrl_pref.pool import QueryPool
 from torchrl_pref.strategies import MakeStrategy, make_strategy
+
+FIRST_BLOCK = 4
+"""Offers that are looked at together at first; twice as many each time that none is asked."""
 
 
 class NothingToAsk(InputError):
@@ -129,18 +133,54 @@ def _let_through(
     env: FeedEnv, strategy: TensorDictModuleBase, state: SessionState, hidden: Tree
 ) -> tuple[Tensor, Tensor]:
     """See :func:`next_question`: offers go by until each person has one that is asked."""
+    if env.batch_size.numel() == 1 and _decides_by_itself(strategy):
+        return _first_asked(env, strategy, state, hidden)
     index, n_offered = torch.full(tuple(env.batch_size), -1), state["n_offered"]
     while (waiting := index < 0).any():
         if (n_offered.squeeze(-1)[waiting] >= env.n_offers).any():
-            raise NothingToAsk(
-                f"offers={env.n_offers}: all went by; expected more offers where more are to be "
-                "asked"
-            )
+            raise _all_went_by(env)
         present: SessionState = {**state, "n_offered": n_offered}
         asks = strategy(env.show(present, hidden))["action"] == 1
         index = torch.where(waiting & asks, env.offered(present, hidden), index)
         n_offered = n_offered + waiting.unsqueeze(-1)
     return index, n_offered
+
+
+def _decides_by_itself(strategy: TensorDictModuleBase) -> bool:
+    """Whether a strategy decides on an offer by what it sees, whoever else it sees beside it.
+
+    One that draws at random does not, and one of the user's may count what it was shown.
+    """
+    known = {"torchrl_pref", "torch", "tensordict", "torchrl"}
+    return all(
+        type(module).__module__.partition(".")[0] in known and not hasattr(module, "generator")
+        for module in strategy.modules()
+    )
+
+
+def _first_asked(
+    env: FeedEnv, strategy: TensorDictModuleBase, state: SessionState, hidden: Tree
+) -> tuple[Tensor, Tensor]:
+    """:func:`_let_through` for one person: the strategy decides on several offers at once, as if
+    they were as many sessions, since all but the first that is asked leave the belief as it is."""
+    first, count = int(state["n_offered"]), FIRST_BLOCK
+    while first < env.n_offers:
+        places = torch.arange(first, min(first + count, env.n_offers)).unsqueeze(-1)
+        several = TensorDict({**state}, [1]).expand(len(places))
+        present = cast(SessionState, {**several, "n_offered": places})
+        each = {key: value.expand(len(places), -1) for key, value in hidden.items()}
+        asked = (strategy(env.show(present, each))["action"] == 1).nonzero()
+        if len(asked):
+            place = int(asked[0])
+            return env.offered(present, each)[place : place + 1], places[place : place + 1] + 1
+        first, count = first + len(places), 2 * count
+    raise _all_went_by(env)
+
+
+def _all_went_by(env: FeedEnv) -> NothingToAsk:
+    return NothingToAsk(
+        f"offers={env.n_offers}: all went by; expected more offers where more are to be asked"
+    )
 
 
 def query_indices(env: QueryEnv | FeedEnv, queries: Sequence[int]) -> Tensor:

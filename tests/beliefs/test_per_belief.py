@@ -27,6 +27,22 @@ def test_only_changed_beliefs_are_computed_anew(generator: Generator) -> None:
         assert torch.equal(remembered(fewer), fewer.square().sum((1, 2)))
 
 
+def test_rows_of_one_belief_are_computed_once(generator: Generator) -> None:
+    asked: list[int] = []
+
+    def count(samples: Tensor) -> Tensor:
+        asked.append(len(samples))
+        return samples.square().sum(1)
+
+    remembered = PerBelief(count)
+    one = torch.randn(1, 7, 3, generator=generator)
+    for rows in (4, 9):
+        assert torch.equal(remembered(one.repeat(rows, 1, 1)), one.square().sum(1).repeat(rows, 1))
+    assert asked == [1]
+    several = torch.cat([one, one, one + 1])
+    assert torch.equal(remembered(several), several.square().sum(1))
+
+
 def test_gradients_pass_through(generator: Generator) -> None:
     remembered = PerBelief(lambda samples: samples.square().sum((1, 2)))
     samples = torch.randn(2, 4, 3, generator=generator)

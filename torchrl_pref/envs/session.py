@@ -229,14 +229,14 @@ class SessionEnv(EnvBase):
         }
 
     def show(self, session: SessionState, hidden: Tree) -> TensorDict:
-        """What a strategy sees of sessions (B) that somebody else keeps, as a live person's.
+        """What a strategy sees of sessions that somebody else keeps, as a live person's.
 
         Args:
-            session: what is known of them.
+            session: what is known of them, of as many as there are.
             hidden: what :meth:`draw_questions` drew for them.
         """
         shown = {**self._shown(session, hidden), "session": session}
-        return TensorDict(shown, self.batch_size, device=self.device)
+        return TensorDict(shown, session["n_asked"].shape[:1], device=self.device)
 
     def _put_on_table(self, shown: dict[str, Tensor], begun: Tensor | None) -> None:
         """Tell random actions what is shown now, in all sessions or where they began (B 1)."""

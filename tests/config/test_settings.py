@@ -61,6 +61,13 @@ def test_every_default_of_a_training_is_legal(setup: str, policy: str, algorithm
     settings.check_run({**run, "overrides": []})
 
 
+@pytest.mark.parametrize("setup", ["query", "feed"])
+@pytest.mark.parametrize("experiment", ["everywhere", "paper"])
+def test_every_experiment_is_legal(setup: str, experiment: str) -> None:
+    check_train_settings(composed("train", f"experiment={experiment}", f"setup={setup}"))
+
+
+
 @pytest.mark.parametrize("typed", ["setup=query", "setup=feed", "+policy=pretrained"])
 def test_every_default_of_an_evaluation_is_legal(typed: str) -> None:
     settings.check_evaluate_settings(composed("evaluate", typed.lstrip("+")))

@@ -64,8 +64,7 @@ def test_every_default_of_a_training_is_legal(setup: str, policy: str, algorithm
 @pytest.mark.parametrize("setup", ["query", "feed"])
 @pytest.mark.parametrize("experiment", ["everywhere", "paper"])
 def test_every_experiment_is_legal(setup: str, experiment: str) -> None:
-    check_train_settings(composed("train", f"experiment={experiment}", f"setup={setup}"))
-
+    settings.check_train_settings(composed("train", f"experiment={experiment}", f"setup={setup}"))
 
 
 @pytest.mark.parametrize("typed", ["setup=query", "setup=feed", "+policy=pretrained"])

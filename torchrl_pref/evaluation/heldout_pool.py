@@ -44,6 +44,7 @@ from torchrl_pref.strategies import (
     RandomQuery,
     ThresholdAsk,
 )
+from torchrl_pref.strategies.lookahead import MOST_FOLLOWED
 
 HUMANS = 100
 
@@ -229,7 +230,8 @@ def _baselines(
     }
     if job.cell.features != "balanced":
         strategies["volume_removal"] = Greedy(model, volume_removal)
-        strategies["lookahead"] = Lookahead(model)
+        if env.n_answers**2 <= MOST_FOLLOWED:
+            strategies["lookahead"] = Lookahead(model)
     return strategies
 
 

@@ -26,6 +26,7 @@ from torchrl_pref.envs.objectives import alignment, alignment_of_mean
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.errors import InputError
 from torchrl_pref.evaluation.comparison import compare, evaluate_task
+from torchrl_pref.evaluation import metrics, views
 from torchrl_pref.evaluation.metrics import (
     ALWAYS,
     BINS,
@@ -289,6 +290,15 @@ def test_strategies_side_by_side_have_a_calibration_each(pool: QueryPool) -> Non
     found = run_side_by_side(make_env, humans, entrants, exam)
     for (result,) in found.values():
         assert result.examined["calibration"].shape == (6, 6, 3 * BINS)
+def test_what_the_humans_want_is_ranked_once(
+    pool: QueryPool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env, ranked = make(QueryEnv, pool, batch=2), []
+    monkeypatch.setattr(metrics, "_centred_ranks", lambda values: ranked.append(0) or values)
+    evaluate(env, RandomQuery(), draw_humans(env), exam=exam_on(pool))
+    assert len(ranked) == 1 + 6  # and what is learned before and after each of five answers
+
+
         assert torch.equal(
             result.metrics["calibration"], calibration(result.examined["calibration"])
         )

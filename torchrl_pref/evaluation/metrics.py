@@ -55,6 +55,17 @@ class Exam:
 
     def to(self, device: torch.device) -> Exam:
         """The same on a device."""
+    def ranks(self, omega: Tensor) -> Tensor | None:
+        """(B T), of the trajectories' rewards to humans (B D): told once, as sorting them takes
+        longer than all else, and no answer changes them. None: no metric looks at them."""
+        if "rank_correlation" not in self.metrics:
+            return None
+        return _centred_ranks(omega @ self.trajectories.mT)
+
+    def without(self, name: str) -> Exam:
+        """The same, but for one metric."""
+        return replace(self, metrics=tuple(each for each in self.metrics if each != name))
+
         return replace(
             self,
             queries=self.queries.to(device),
@@ -75,6 +86,8 @@ class Standing:
         response_model: how the belief thinks that people answer.
     """
 
+        ranks: (B T), of the trajectories' rewards to the humans where they are known already, see
+            :meth:`Exam.ranks`.
     samples: Tensor
     omega: Tensor
     answers: Tensor
@@ -82,6 +95,7 @@ class Standing:
     response_model: ResponseModel
 
     @cached_property
+    ranks: Tensor | None = None
     def predicted(self) -> Tensor:
         """(B N R), how likely the beliefs hold each answer to be."""
         queries = self.exam.queries.expand(len(self.samples), *self.exam.queries.shape)
@@ -130,7 +144,8 @@ def regret(standing: Standing) -> Tensor:
 def rank_correlation(standing: Standing) -> Tensor:
     """(B), Spearman's between the trajectories' rewards to the human and as the belief expects;
     0 where one of them is the same for all."""
-    true, learned = (_centred_ranks(rewards) for rewards in standing.rewards)
+    true, learned = standing.ranks, _centred_ranks(standing.rewards[1])
+    true = _centred_ranks(standing.rewards[0]) if true is None else true
     lengths = (true.square().sum(-1) * learned.square().sum(-1)).sqrt()
     return (true * learned).sum(-1) / lengths.clamp(min=1e-12)
 

@@ -79,7 +79,7 @@ class Examiner:
             human = session["human"]
             self.model, self.omega = env.belief.response_model, human["omega"]
             self.exam = exam = exam.to(self.omega.device)
-            seen = exam.seen.to(self.omega)
+            seen, self.ranks = exam.seen.to(self.omega), exam.ranks(self.omega)
             self.answers = env.human.log_probs(seen.expand(len(human), *seen.shape), human).exp()
 
     def __call__(self, session: TensorDictBase) -> dict[str, Tensor]:
@@ -91,9 +91,9 @@ class Examiner:
         if not len(who):
             return self.values
         start = time.perf_counter()
-        standing = Standing(
-            *(kept["samples"][who], self.omega[who], self.answers[who]), self.exam, self.model
-        )
+        ranks = None if self.ranks is None else self.ranks[who]
+        of_them = kept["samples"][who], self.omega[who], self.answers[who]
+        standing = Standing(*of_them, self.exam, self.model, ranks)
         for name, values in measure(self.exam.metrics, standing).items():
             before = self.values.get(name, values)
             self.values[name] = before.index_copy(0, who, values)

@@ -351,8 +351,14 @@ def test_report_shows_what_was_asked_for(tmp_path: Path) -> None:
 def test_metrics_that_may_be_typed() -> None:
     for typed in ("[]", "[alignment,calibration]", "[accuracy]"):
         check_evaluate_settings(composed("evaluate", f"evaluation.metrics={typed}"))
-    for typed in ("calibration", "[calibration,calibration]", "[luck]", "5", "null"):
-        with pytest.raises(InputError, match=r"evaluation\.metrics"):
+    for typed, mend in (
+        ("regret", "[regret]"),  # a name alone, and how to write it
+        ("[regret,regret]", "[regret]"),
+        ("[luck]", "[alignment]"),
+        ("5", "[alignment]"),
+        ("null", "[alignment]"),
+    ):
+        with pytest.raises(InputError) as refused:
             check_evaluate_settings(composed("evaluate", f"evaluation.metrics={typed}"))
 
 
@@ -372,6 +378,9 @@ def test_mean_answers_are_the_means_of_what_samples_predict(
 ) -> None:
     rng = Generator().manual_seed(5)
     samples = uniform_sphere((2, 3000, 4), rng)  # fifty queries are beyond a chunk
+        told = str(refused.value)
+        assert f"as in 'evaluation.metrics={mend}', or 'evaluation.metrics=[]'" in told
+        assert "alignment, alignment_of_mean, accuracy" in told
     queries = torch.randn(2, 50, n_options, 4, generator=rng)
     queries[0, 0] = queries[0, 0, :1]  # a tie
     returns = torch.einsum("bckd,bmd->bcmk", queries, samples)

@@ -130,8 +130,9 @@ def run_pool(job: Job) -> list[Entry]:
     make_env = partial(_make_env, job, task, pool, seed)
     env = make_env(HUMANS)
     humans = draw_humans(env)
-    judged = _judged(job, env, seed)
-    lineup = [*_lineup(job, task, env, seed), *judged]
+    baselines = _lineup(job, task, env, seed)
+    judged = _judged(job, env, seed, [entrant.key for entrant in baselines])
+    lineup = [*baselines, *judged]
     torch.manual_seed(seed)  # of policies that draw their actions
     exam = make_exam(job.settings, task, pool)
     results = run_side_by_side(make_env, humans, lineup, exam)
@@ -191,14 +192,14 @@ def try_job(job: Job) -> None:
     try_own(find_makers(job.own), env)
 
 
-def _judged(job: Job, env: QueryEnv | FeedEnv, seed: int) -> list[Entrant]:
-    """The policies, and the strategies of the user."""
+def _judged(job: Job, env: QueryEnv | FeedEnv, seed: int, beside: Sequence[str]) -> list[Entrant]:
+    """The policies, and the strategies of the user that are no baselines beside them."""
     policies = [
         Entrant(key, load_policy(one, env).strategy, one.settings["policy"]["sample"])
         for key, checkpoints in job.learned.items()
         for one in checkpoints
     ]
-    return [*policies, *make_own(find_makers(job.own), env, seed)]
+    return [*policies, *make_own(find_makers(job.own), env, seed, beside)]
 
 
 def _lineup(job: Job, task: Problem, env: QueryEnv | FeedEnv, seed: int) -> list[Entrant]:

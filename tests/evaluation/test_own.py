@@ -140,6 +140,8 @@ def test_the_protocol_pairs_several_kinds_and_the_user_s_own(
     assert [values.shape[1] for values in found.values()] == [2, 1, 1]
     assert all(torch.equal(v[0, 0, :, 0], found[judged[0]][0, 0, :, 0]) for v in found.values())
     alone = Records(run_pool(Job(settings_of("query"), job.cell, 0, kinds)))
+    assert records.has("random", "calibration")
+    assert not records.has("greedy_many_samples:M=40", "calibration")  # of a few humans
     for key in alone.strategies:  # the baselines' numbers depend on who is beside them in nothing
         assert alone.values(key, "alignment").shape == records.values(key, "alignment").shape
     text = tables(records)

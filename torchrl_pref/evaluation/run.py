@@ -39,6 +39,7 @@ class Evaluation:
         seconds_per_query: wall time of the whole session (choice, answer, belief) over the queries
             asked of all B humans; measuring what was asked for beside alignment is not in it.
         examined: (B H+1 …), the metrics that were asked for, as they were measured.
+        batch: how many queries were asked at once.
 
     Where a session ended before j answers, column j holds its last value.
     """
@@ -52,12 +53,14 @@ class Evaluation:
     repeated: Tensor
     seconds_per_query: float
     examined: Mapping[str, Tensor] = field(default_factory=dict)
+    batch: int = 1
 
     @property
     def metrics(self) -> dict[str, Tensor]:
-        """The metrics that were asked for beside alignment, by name (B H+1)."""
+        """The metrics that were asked for beside alignment, by name (B H+1); of what is told of all
+        humans together (1 H+1)."""
         return {
-            name: calibration(values) if name == "calibration" else values.squeeze(-1)
+            name: calibration(values)[None] if name == "calibration" else values.squeeze(-1)
             for name, values in self.examined.items()
         }
 
@@ -155,6 +158,7 @@ def evaluate(
         offered=offered,
         repeated=_count_repeats(history),
         seconds_per_query=seconds / max(1, int(asked.sum())),
+        batch=env.batch,
     )
 
 

@@ -129,7 +129,7 @@ def _rows(task: str, results: list[Result], batch: int, budget: int) -> Iterator
     before: Tensor | None = None
     for name in results[0]:
         curves = torch.stack([result[name][0] for result in results])  # (pools H+1)
-        row: common.Row = {"task": task, "strategy": name.replace("_", " ")}
+        row: common.Row = {"task": task, "strategy": name}
         for asked in range(batch, budget + 1, batch):
             row[f"after {asked}"] = _interval(curves[:, asked])
         told = torch.arange(batch, budget + 1, batch)

@@ -219,7 +219,7 @@ def objectives(folder: Path) -> dict[str, str]:
             row = {"strategy": f"{name_of(key)}, {run}" if is_judged(key) else name_of(key)}
             values = alignment(records, key)
             row |= {f"after {j}": f"{values[..., j].mean():.3f}" for j in milestones(20)}
-            row["minus greedy information gain, last"] = interval(gap)
+            row["minus information_gain, last"] = interval(gap)
             rows.append(row)
     return {"objectives": table(rows)}
 
@@ -240,7 +240,7 @@ def tasks(folder: Path) -> dict[str, str]:
             row = {"strategy": name_of(key)}
             row |= {f"after {j}": f"{values[..., j].mean():.3f}" for j in milestones(20)}
             row["mean of 1 to 20"] = f"{values[..., 1:].mean():.3f}"
-            row["minus greedy information gain, mean"] = (
+            row["minus information_gain, mean"] = (
                 "" if key == "greedy_information" else interval(gap[..., 1:].mean(-1))
             )
             rows.append(row)

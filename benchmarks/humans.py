@@ -86,7 +86,7 @@ def _reached(result: Evaluation) -> str:
     """The mean alignment, the cosine of the mean with twice its standard error, and calibration."""
     cosines = result.alignment_of_mean[:, -1]
     error = 2 * cosines.std() / len(cosines) ** 0.5
-    wrong = result.metrics["calibration"][:, -1].mean()
+    wrong = result.metrics["calibration"][0, -1]
     aligned = result.alignment[:, -1].mean()
     return f"{aligned:.3f} / {cosines.mean():.3f} ± {error:.3f} / {wrong:.3f}"
 

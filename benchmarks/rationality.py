@@ -82,7 +82,7 @@ def main() -> None:
         for kind, each in inside.items():
             shares = torch.stack(each).mean(0).tolist()
             levels = dict(zip(map("{:.0%}".format, LEVELS), shares, strict=True))
-            error = float(calibration(torch.cat(foreseen[kind])).mean())
+            error = float(calibration(torch.cat(foreseen[kind])))
             of = {"pool": name, "greedy by": how, "belief": kind}
             covered.append({**of, **levels, "calibration error": error})
     title = f"Cosine of the mean after {BUDGET} answers, {options.humans} humans a row"

@@ -61,7 +61,7 @@ def test_train_evaluate_and_resume(tmp_path: Path) -> None:
     with (folder / "training.csv").open() as file:
         assert [int(row["update"]) for row in csv.DictReader(file)] == [0, 1, 2, 3]
     assert list((folder / "tensorboard").glob("events*"))
-    for row in ("random", "greedy information gain", "ask all", "RL-feed"):
+    for row in ("random", "information_gain", "ask all", "RL-feed"):
         assert re.search(rf"^{re.escape(row)} +-?\d\.\d+ +-?\d\.\d+ +-?\d\.\d+", output, re.M)
     assert "noisy human (tau=" in output
     assert "only the critic learns in the first training.warm_up=10 updates" in output

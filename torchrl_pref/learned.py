@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchrl_pref.acquisition.functions import alignment_gain
-from torchrl_pref.acquisition.scoring import predict_answers, score_queries
+from torchrl_pref.acquisition.scoring import mean_answers, score_queries
 from torchrl_pref.beliefs.base import BeliefBase
 from torchrl_pref.envs.transition import SessionState
 from torchrl_pref.errors import InputError
@@ -182,6 +182,6 @@ def likelihoods(
         answers: (B H), negative where there is none.
         response_model: how the belief thinks that people answer.
     """
-    probs = predict_answers(samples, options, response_model).probs.mean(-2)
+    probs = mean_answers(samples, options, response_model)
     given = probs.gather(-1, answers.clamp(min=0).unsqueeze(-1)).squeeze(-1)
     return torch.where(answers < 0, 1.0, given)

@@ -155,6 +155,27 @@ def test_a_pair_that_is_not_among_the_farthest_is_found() -> None:
     assert (torch.pdist(samples) > expected + 1e-3).sum() > 2 * len(samples)
 
 
+def test_of_queries_with_the_same_farthest_pair_the_order_of_the_pool_decides_nothing(
+    generator: Generator,
+) -> None:
+    """They tie at its distance: asked is where these two samples have most at stake."""
+    samples, queries = (
+        uniform_sphere((1, 20, 3), generator),
+        torch.randn(1, 200, 2, 3, generator=generator),
+    )
+    found = score_queries(samples, queries, Boltzmann(4.4), disagreement)[0]
+    tied = (found.float() == found.float().max()).nonzero().squeeze(-1)
+    assert len(tied) > 10
+    apart = torch.cdist(samples[0], samples[0])
+    one, other = divmod(int(apart.argmax()), 20)
+    psi = queries[0, tied, 0] - queries[0, tied, 1]
+    stake = (psi @ (samples[0, one] - samples[0, other])).abs()
+    assert int(found.argmax()) == int(tied[stake.argmax()])
+    order = torch.randperm(200, generator=generator)
+    again = score_queries(samples, queries[:, order].flip(2), Boltzmann(4.4), disagreement)[0]
+    assert int(order[again.argmax()]) == int(found.argmax())
+
+
 def test_knowledge_gradient_is_in_parts_what_it_is_as_a_whole(
     generator: Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:

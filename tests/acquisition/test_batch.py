@@ -25,9 +25,11 @@ from torchrl_pref.acquisition.functions import information_gain
 from torchrl_pref.acquisition.scoring import predict_answers
 from torchrl_pref.beliefs.sampled import uniform_sphere
 from torchrl_pref.errors import InputError
+from torchrl_pref.questions.approve import Approve
 from torchrl_pref.questions.ranking import Ranking
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.questions.responses import Boltzmann
+from torchrl_pref.strategies.batches import threshold_of
 
 MODEL = Boltzmann(2.0)
 
@@ -90,10 +92,36 @@ def test_the_order_of_the_options_makes_no_difference(name: str) -> None:
 @pytest.mark.parametrize("name", BATCHES)
 def test_questions_that_are_all_the_same_still_make_a_batch(name: str) -> None:
     best = shortlist(1)
-    same = Shortlist(*(part.repeat(12, *(1,) * (part.ndim - 1)) for part in best))
+    same = Shortlist(*(part.repeat(12, *(1,) * (part.ndim - 1)) for part in best[:3]))
     assert len(set(BATCHES[name](same, 4).tolist())) == 4
     nothing = Shortlist(*(torch.zeros_like(part) for part in same[:2]), same.probs)
     assert len(set(BATCHES[name](nothing, 4).tolist())) == 4
+
+
+def test_one_option_and_its_mirror_image_are_one_question_only_where_the_threshold_is_0() -> None:
+    """Is it good? Who says so of one, says no of the other; but few may please who is strict."""
+    best = shortlist(20, 1, model=Boltzmann(2.0, Approve()))
+    mirrored = best._replace(queries=torch.cat([best.queries, -best.queries]))
+    assert distances(mirrored.psi).diagonal(20).abs().max() < 1e-9
+    strict = mirrored._replace(threshold=0.5)
+    assert torch.allclose(distances(strict.psi).diagonal(20), torch.ones(()).double())
+    apart = distances(strict.psi)[:20, :20]
+    assert (apart >= distances(mirrored.psi)[:20, :20] - 1e-9).all()
+    assert threshold_of(Boltzmann(2.0, Approve(-1.0))) == 0.5  # in units of the return
+
+
+def test_many_answers_take_no_more_memory_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    best, largest = shortlist(20, 4, 10, Boltzmann(2.0, Ranking())), []
+    whole, entr = joint(best, 4), torch.special.entr
+
+    def watched(numbers: Tensor) -> Tensor:
+        largest.append(numbers.numel())
+        return entr(numbers)
+
+    monkeypatch.setattr(batch, "HELD", 24 * 20 * 10)
+    monkeypatch.setattr(torch.special, "entr", watched)
+    assert torch.equal(joint(best, 4), whole)
+    assert max(largest) <= 24 * 20 * 10
 
 
 def test_top_is_what_is_worth_most() -> None:

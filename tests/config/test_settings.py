@@ -182,6 +182,16 @@ def test_a_pool_of_ones_own_counts_as_large_as_it_is() -> None:
         memory.check_memory(typed, 10**10, 2, 4)
 
 
+def test_a_batch_of_questions_with_many_answers_is_counted() -> None:
+    """720 orders of six options, of 400 candidates, under 100,000 samples: 690 GB."""
+    typed = composed("evaluate", "setup=query", "setup.batch=20", "question=ranking")
+    typed["belief"]["samples"] = 100_000
+    size = {part.what: part.size for part in memory.parts_of(typed, 1000, 6, 4)}
+    assert size["choosing a batch"] == 24.0 * 400 * 100_000 * 720
+    with pytest.raises(InputError, match=r"samples=100000: choosing a batch"):
+        memory.check_memory({**typed, "pool": {**typed["pool"], "train": "mine.pt"}}, 1000, 6, 4)
+
+
 @pytest.mark.parametrize(
     "key", ["tau", "seed", "training.gamma", "logger", "setup", "policy", "algorithm", "belief"]
 )

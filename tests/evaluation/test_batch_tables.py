@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,6 +16,7 @@ from torchrl_pref.evaluation.comparison import evaluate_task, try_strategies
 from torchrl_pref.evaluation.records import Records
 from torchrl_pref.evaluation.style import KINDS
 from torchrl_pref.evaluation.tables import tables
+from torchrl_pref.evaluation.views import write_curves
 from torchrl_pref.strategies import BATCH_STRATEGIES, RandomQuery
 
 
@@ -25,7 +28,7 @@ def evaluated(batch: int, options: int = 2, own: dict[str, Any] | None = None) -
     return evaluate_task(settings, task, {}, own=own)
 
 
-def test_batches_take_the_place_of_what_asks_one_at_a_time() -> None:
+def test_batches_take_the_place_of_what_asks_one_at_a_time(tmp_path: Path) -> None:
     assert evaluated(1).strategies == ["random", "greedy_information", "greedy_alignment"]
     records = evaluated(2, own={"mine:rule": BATCH_STRATEGIES["top"]})
     batches = [f"batch_{name}" for name in BATCH_STRATEGIES if name != "random"]
@@ -37,8 +40,17 @@ def test_batches_take_the_place_of_what_asks_one_at_a_time() -> None:
     assert (curves[..., 3] == curves[..., 2]).all()
     # A strategy of the user that is ours does as ours does, on the same humans with their luck.
     assert (records.values("own:mine:rule", "alignment") == curves).all()
-    assert "queries are asked in batches" in tables(records)
-    assert "queries are asked in batches" not in tables(evaluated(1))
+    text, alone = tables(records), tables(evaluated(1))
+    assert "queries are asked in batches of 2" in text
+    assert "queries are asked in batches" not in alone
+    # What is held between two batches is no measurement: after 2 and 4, and the mean of these.
+    assert "after 2    after 4    mean of 2 to 4" in text
+    assert "after 1    after 2    after 4    mean of 1 to 4" in alone
+    top = next(line for line in text.splitlines() if line.startswith("top"))
+    assert f"{curves[..., [2, 4]].mean():.3f}" in top
+    write_curves(tmp_path / "curves.csv", records)
+    with (tmp_path / "curves.csv").open() as file:
+        assert {row["query"] for row in csv.DictReader(file)} == {"0", "2", "4"}
 
 
 def test_questions_about_three_options_have_the_batches_that_need_no_pairs() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +26,7 @@ from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.objectives import alignment, alignment_of_mean
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.errors import InputError
+from torchrl_pref.evaluation import metrics, views
 from torchrl_pref.evaluation.comparison import compare, evaluate_task
 from torchrl_pref.evaluation.metrics import (
     ALWAYS,
@@ -160,14 +162,24 @@ def test_calibration_is_the_error_of_all_humans_together() -> None:
     standing = some(Boltzmann(4.4), n_options=3)
     predicted, given = standing.predicted.flatten(), standing.answers.flatten()
     place = np.minimum((predicted * BINS).numpy().astype(int), BINS - 1)
-    error = sum(abs(float((predicted - given)[place == one].sum())) for one in range(BINS)) / len(
-        place
-    )
-    parts = calibration(reliability(standing))
-    assert parts.shape == (3,)
-    assert float(parts.mean()) == pytest.approx(error, abs=1e-6)
-    curve = torch.stack([reliability(standing), 2 * reliability(standing)], 1)
-    assert torch.allclose(calibration(curve)[:, 1], 2 * parts)
+    gaps = [float((predicted - given)[place == one].sum()) for one in range(BINS)]
+    found = reliability(standing)
+    assert float(calibration(found)) == pytest.approx(sum(map(abs, gaps)) / len(place), abs=1e-6)
+    assert float(found[:, :BINS].sum()) == len(place)  # every answer is in a bin
+    curve = torch.stack([found, found.flip(0)], 1)  # the order of humans makes no difference
+    assert torch.allclose(calibration(curve), calibration(found).expand(2))
+
+
+@pytest.mark.parametrize(("n_samples", "most"), [(100, 0.02), (400, 0.003)])
+def test_who_knows_nothing_is_calibrated_but_for_the_luck_of_the_samples(
+    n_samples: int, most: float
+) -> None:
+    """Predictions scatter about ½ by .045, or half of it: a third, or none, leave its bin."""
+    rng = Generator().manual_seed(0)
+    omega, samples = uniform_sphere((100, 4), rng), uniform_sphere((100, n_samples, 4), rng)
+    prior = standing_of(samples, omega, Boltzmann(4.4))
+    of_nobody = replace(prior, answers=torch.full_like(prior.answers, 0.5))
+    assert float(calibration(reliability(of_nobody))) < most
 
 
 def test_a_belief_of_the_population_is_calibrated_and_one_of_a_wrong_tau_is_not() -> None:
@@ -178,7 +190,7 @@ def test_a_belief_of_the_population_is_calibrated_and_one_of_a_wrong_tau_is_not(
     samples = humans.expand(len(humans), *humans.shape)
 
     def error(assumed: ResponseModel, truth: ResponseModel) -> float:
-        return float(calibration(reliability(standing_of(samples, humans, assumed, truth))).mean())
+        return float(calibration(reliability(standing_of(samples, humans, assumed, truth))))
 
     assert error(model, model) == pytest.approx(0, abs=1e-5)
     assert error(Optimal(), Optimal()) == pytest.approx(0, abs=1e-5)
@@ -245,7 +257,8 @@ def test_curves_are_those_of_the_states_and_measuring_changes_nothing(
     assert torch.equal(plain.ess, result.ess)
     assert plain.metrics == {}
     assert set(result.metrics) == set(ASKED)
-    assert all(values.shape == (6, 6) for values in result.metrics.values())
+    for name, values in result.metrics.items():
+        assert values.shape == (1 if name == "calibration" else 6, 6)
     env.set_seed(5)
     session = env.reset(humans.clone(), set_state=True)
     again = coin(env, 3)
@@ -277,6 +290,15 @@ def test_only_the_time_of_the_sessions_is_told(
     assert result.seconds_per_query == pytest.approx((27 - 10 - 5) / 40)
 
 
+def test_what_the_humans_want_is_ranked_once(
+    pool: QueryPool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env, ranked = make(QueryEnv, pool, batch=2), []
+    monkeypatch.setattr(metrics, "_centred_ranks", lambda values: ranked.append(0) or values)
+    evaluate(env, RandomQuery(), draw_humans(env), exam=exam_on(pool))
+    assert len(ranked) == 1 + 6  # and what is learned before and after each of five answers
+
+
 def test_strategies_side_by_side_have_a_calibration_each(pool: QueryPool) -> None:
     humans = draw_humans(make(QueryEnv, pool, batch=6))
     exam = exam_on(pool)
@@ -289,10 +311,8 @@ def test_strategies_side_by_side_have_a_calibration_each(pool: QueryPool) -> Non
     found = run_side_by_side(make_env, humans, entrants, exam)
     for (result,) in found.values():
         assert result.examined["calibration"].shape == (6, 6, 3 * BINS)
-        assert torch.equal(
-            result.metrics["calibration"], calibration(result.examined["calibration"])
-        )
-        assert (result.metrics["calibration"].mean(0) >= 0).all()
+        together = calibration(result.examined["calibration"])
+        assert torch.equal(result.metrics["calibration"], together.unsqueeze(0))
 
 
 def test_questions_are_of_the_pool_that_nothing_asks_from() -> None:
@@ -316,7 +336,7 @@ def test_questions_are_of_the_pool_that_nothing_asks_from() -> None:
     assert make_exam(settings, task, task.test) is None
 
 
-def test_report_shows_what_was_asked_for(tmp_path: Path) -> None:
+def test_report_shows_what_was_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     settings = settings_of("query")
     settings["evaluation"] = {"humans": 5, "seed": 1, "metrics": ["calibration", "regret"]}
     task = make_task(*make_pools(settings), "noisy", settings)
@@ -329,9 +349,17 @@ def test_report_shows_what_was_asked_for(tmp_path: Path) -> None:
     for name in ("calibration", "regret"):
         assert torch.equal(again.values("random", name)[0, 0], result.metrics[name])
     assert set(RELIABILITY) < set(again.metrics)
+    counts = [int(again.values("random", name)) for name in RELIABILITY[:BINS]]
+    assert sum(counts) == 5 * 30 * 2
+    monkeypatch.setattr(views, "FEWEST", sorted(counts)[-2])  # the second largest is enough
     predicted, given = reliability_of(again, "random")
+    assert len(predicted) == len([one for one in counts if one >= views.FEWEST])
     assert ((predicted >= 0) & (predicted <= 1) & (given >= 0) & (given <= 1)).all()
     assert (predicted.diff() > 0).all()
+    with (tmp_path / "curves.csv").open() as file:
+        bands = {row["metric"] for row in csv.DictReader(file) if row["low"]}
+    assert {"alignment", "regret"} <= bands  # of all humans together there is no interval
+    assert "calibration" not in bands
     head = (tmp_path / "tables.txt").read_text()
     assert "regret" in head
     assert "calibration" in head
@@ -341,9 +369,18 @@ def test_report_shows_what_was_asked_for(tmp_path: Path) -> None:
 def test_metrics_that_may_be_typed() -> None:
     for typed in ("[]", "[alignment,calibration]", "[accuracy]"):
         check_evaluate_settings(composed("evaluate", f"evaluation.metrics={typed}"))
-    for typed in ("calibration", "[calibration,calibration]", "[luck]", "5", "null"):
-        with pytest.raises(InputError, match=r"evaluation\.metrics"):
+    for typed, mend in (
+        ("regret", "[regret]"),  # a name alone, and how to write it
+        ("[regret,regret]", "[regret]"),
+        ("[luck]", "[alignment]"),
+        ("5", "[alignment]"),
+        ("null", "[alignment]"),
+    ):
+        with pytest.raises(InputError) as refused:
             check_evaluate_settings(composed("evaluate", f"evaluation.metrics={typed}"))
+        told = str(refused.value)
+        assert f"as in 'evaluation.metrics={mend}', or 'evaluation.metrics=[]'" in told
+        assert "alignment, alignment_of_mean, accuracy" in told
 
 
 @pytest.mark.parametrize(

@@ -104,7 +104,8 @@ def test_what_cannot_decide_is_refused_before_anything_is_run(mine: str, pool: Q
 def test_a_strategy_of_the_user_is_a_row_beside_ours(mine: str, setup: str) -> None:
     settings = settings_of(setup)
     _, task = trainer_of(settings)
-    makers = find_makers([f"{mine}:rule"])
+    # One that is a baseline already, under the same name, has no second row.
+    makers = find_makers([f"{mine}:rule", "alignment_gain"])
     try_strategies(makers, settings, task)
     with_it = compare(settings, task, task.test, {}, makers)
     without = compare(settings, task, task.test, {})
@@ -139,6 +140,8 @@ def test_the_protocol_pairs_several_kinds_and_the_user_s_own(
     assert [values.shape[1] for values in found.values()] == [2, 1, 1]
     assert all(torch.equal(v[0, 0, :, 0], found[judged[0]][0, 0, :, 0]) for v in found.values())
     alone = Records(run_pool(Job(settings_of("query"), job.cell, 0, kinds)))
+    assert records.has("random", "calibration")
+    assert not records.has("greedy_many_samples:M=40", "calibration")  # of a few humans
     for key in alone.strategies:  # the baselines' numbers depend on who is beside them in nothing
         assert alone.values(key, "alignment").shape == records.values(key, "alignment").shape
     text = tables(records)

@@ -79,7 +79,7 @@ def test_tables_and_curves_say_what_was_measured(records: Records, tmp_path: Pat
     first, *rows = alignment_table(records, style="tsv").splitlines()
     head, row = ([cell.strip() for cell in line.split("\t")] for line in (first, rows[1]))
     cells = dict(zip(head, row, strict=True))
-    assert cells["strategy"] == "greedy information gain"
+    assert cells["strategy"] == "information_gain"
     assert cells["after 5"] == f"{greedy[:, 5].mean():.3f}"
     assert cells["held against"] == "random"
     assert cells["minus that [95%]"].startswith(f"{(greedy - random)[:, 5].mean():+.3f} [")
@@ -154,7 +154,7 @@ def test_a_strategy_looks_alike_wherever_it_is_shown() -> None:
     looks = [style[1:] for key, style in among.items() if KINDS[key.partition(":")[0]].drawn]
     assert len(set(looks)) == len(looks)
     names = [style.name for style in among.values()]
-    assert names.count("greedy information gain") == 2  # once with more samples, as its key says
+    assert names.count("information_gain") == 2  # once with more samples, as its key says
     assert len(set(SPARE)) == len(SPARE)
     assert name_of("quantile") == name_of("quantile_alignment")  # of an older checkpoint
 
@@ -196,7 +196,7 @@ def test_a_belief_worth_few_samples_is_told() -> None:
     assert few_samples(Records([ess("greedy_information", 51.0), ess("random")])) == []
     told = Records([ess("greedy_information", 60.0, 21.0), ess("random")])
     line, blank = few_samples(told)
-    assert line.startswith("! greedy information gain: in 1 of 3 sessions")
+    assert line.startswith("! information_gain: in 1 of 3 sessions")
     assert "least: 21 of 100" in line
     assert blank == ""
 

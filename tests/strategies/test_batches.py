@@ -12,7 +12,10 @@ from torchrl_pref.acquisition.batch import BATCHES, OF_PAIRS, Shortlist, joint, 
 from torchrl_pref.acquisition.functions import alignment_gain, information_gain
 from torchrl_pref.acquisition.scoring import predict_answers, score_queries
 from torchrl_pref.pool import QueryPool
+from torchrl_pref.questions.approve import Approve
+from torchrl_pref.questions.choice import Choice
 from torchrl_pref.questions.response_model import ResponseModel
+from torchrl_pref.questions.responses import Boltzmann
 from torchrl_pref.strategies import BATCH_STRATEGIES, BatchOf, Greedy
 from torchrl_pref.tasks.gridworld import gridworld_pool
 
@@ -60,6 +63,20 @@ def test_the_shortlist_is_of_the_best_that_are_allowed(pool: QueryPool) -> None:
         assert torch.equal(values[b, action[b]], best.values[:3])
         predicted = predict_answers(session["samples"][b : b + 1], best.queries[None], MODEL)
         assert torch.equal(best.probs, predicted.probs[0])
+
+
+def test_of_one_option_the_threshold_is_known(pool: QueryPool) -> None:
+    shown: list[float] = []
+
+    def look(best: Shortlist, n: int) -> torch.Tensor:
+        shown.append(best.threshold)
+        return top(best, n)
+
+    session = env_of(pool, batch=1).reset()
+    for options, question in ((1, Approve(1.0)), (2, Choice())):
+        session["queries"] = pool.features[:, :options].expand(4, -1, -1, -1)
+        BatchOf(Boltzmann(2.0, question), 1, look)(session)
+    assert shown == [0.5] * 4 + [0.0] * 4
 
 
 @pytest.mark.parametrize("select", [top, joint])

@@ -13,8 +13,10 @@ from torchrl_pref.acquisition.scoring import predict_answers, score_queries
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.errors import InputError
 from torchrl_pref.pool import QueryPool
+from torchrl_pref.questions.ranking import Ranking
 from torchrl_pref.questions.response_model import ResponseModel
-from torchrl_pref.strategies import AlignmentLookahead
+from torchrl_pref.questions.responses import Boltzmann
+from torchrl_pref.strategies import STRATEGIES, AlignmentLookahead
 
 
 def best(weights: Tensor, probs: Tensor, units: Tensor, steps: int) -> Tensor:
@@ -66,6 +68,22 @@ def test_with_one_question_left_it_is_greedy(generator: Generator) -> None:
     chosen = AlignmentLookahead(model, 3)(session)["action"]
     gain = score_queries(session["samples"], session["queries"], model, alignment_gain)
     assert torch.allclose(gain[range(8), chosen], gain.amax(1), atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["lookahead", "alignment_lookahead"])
+def test_too_many_answers_are_refused_where_it_is_made(name: str) -> None:
+    def env(options: int) -> QueryEnv:
+        pool = QueryPool(torch.randn(3, options, 4))
+        made = make(QueryEnv, pool, Boltzmann(2.0, Ranking()), 1)
+        assert isinstance(made, QueryEnv)
+        return made
+
+    with pytest.raises(InputError, match=r"120 answers: .* 14400 sequences .* at most 1000"):
+        STRATEGIES[name](env(5))
+    few = env(4)
+    assert STRATEGIES[name](few)(few.reset())["action"].shape == (1,)
+    with pytest.raises(InputError, match="looking 3 questions ahead"):
+        AlignmentLookahead(Boltzmann(2.0, Ranking()), steps=3)(few.reset())
 
 
 @pytest.mark.parametrize("wrong", [{"steps": 0}, {"beam": 0}])

@@ -17,12 +17,16 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from torchrl_pref.errors import InputError
 
 CONFIGURATIONS = 1024
 """Combinations of answers that :func:`joint` follows: all of them for 10 questions of 2 answers."""
+
+HELD = 2_000_000
+"""Probabilities (R g P) that it holds at once: bounds memory where there are many answers."""
 
 
 class Shortlist(NamedTuple):
@@ -34,10 +38,13 @@ class Shortlist(NamedTuple):
     """(P K D), features of the options."""
     probs: Tensor
     """(P M R), probability of each answer under each sample."""
+    threshold: float = 0.0
+    """Of questions about one option: the return above which it is good."""
 
     @property
     def psi(self) -> Tensor:
-        """(P D), ψ in double precision; of a single option its features.
+        """(P D), ψ in double precision. A single option is held against the threshold: its features
+        (P D+1), and the threshold as one more, which -ψ has with the other sign.
 
         Raises:
             InputError: a question is about more than two.
@@ -47,8 +54,10 @@ class Shortlist(NamedTuple):
                 f"batches by features of questions about {self.queries.shape[1]} options: expected "
                 "2, as what they differ in is told of pairs; choose a batch by top or joint"
             )
-        first, last = self.queries[:, 0], self.queries[:, -1]
-        return (first if self.queries.shape[1] == 1 else first - last).double()
+        first, last = self.queries[:, 0].double(), self.queries[:, -1].double()
+        if self.queries.shape[1] == 1:
+            return F.pad(first, (0, 1), value=self.threshold)
+        return first - last
 
 
 Select = Callable[[Shortlist, int], Tensor]
@@ -155,9 +164,13 @@ def joint(best: Shortlist, n: int) -> Tensor:
     share = probs.new_ones(1)  # (G), probability of each combination of earlier answers
     likely = probs.new_full((1, probs.shape[1]), 1 / probs.shape[1])  # (G M), samples after it
     chosen: list[int] = []
+    step = max(1, HELD // noise.numel() // probs.shape[-1])
     for _ in range(n):
-        later = torch.einsum("gm,pmr->rgp", likely, probs)
-        gain = share @ torch.special.entr(later).sum(0) - noise
+        gain = torch.zeros_like(noise)
+        for some, weight in zip(likely.split(step), share.split(step), strict=True):
+            later = torch.einsum("gm,pmr->rgp", some, probs)
+            gain += weight @ torch.special.entr(later).sum(0)
+        gain -= noise
         gain[chosen] = -math.inf
         chosen.append(int(gain.argmax()))
         share, likely = _followed(share, likely, probs[chosen[-1]])
@@ -166,15 +179,15 @@ def joint(best: Shortlist, n: int) -> Tensor:
 
 def _followed(share: Tensor, likely: Tensor, probs: Tensor) -> tuple[Tensor, Tensor]:
     """Combinations of answers (G) with samples (G M), after one more answer of probs (M R)."""
-    told = likely.unsqueeze(1) * probs.mT  # (G R M)
-    of_answer = told.sum(-1, keepdim=True)
-    share = (share.unsqueeze(1) * of_answer.squeeze(-1)).flatten()
-    likely = (told / of_answer.clamp(min=1e-300)).flatten(0, 1)
+    share = (share.unsqueeze(1) * (likely @ probs)).flatten()
+    kept = torch.arange(len(share), device=share.device)
     if len(share) > CONFIGURATIONS:
         steps = (torch.arange(CONFIGURATIONS).to(share) + 0.5) / CONFIGURATIONS
-        drawn = torch.searchsorted(share.cumsum(0) / share.sum(), steps).clamp(max=len(share) - 1)
-        return torch.full_like(steps, 1 / CONFIGURATIONS), likely[drawn]
-    return share, likely
+        kept = torch.searchsorted(share.cumsum(0) / share.sum(), steps).clamp(max=len(share) - 1)
+        share = torch.full_like(steps, 1 / CONFIGURATIONS)
+    n_answers = probs.shape[-1]
+    told = likely[kept // n_answers] * probs.mT[kept % n_answers]  # of those alone that are kept
+    return share, told / told.sum(-1, keepdim=True).clamp(min=1e-300)
 
 
 BATCHES: dict[str, Select] = {

@@ -18,6 +18,9 @@ from torch import Tensor
 from torchrl_pref.questions.response_model import Prediction
 from torchrl_pref.tensors import ROUNDING, directions, lengths
 
+BELOW = 2.0**-25
+"""Times a number: less than any digit that it has in single precision."""
+
 
 def max_regret(predicted: Prediction, samples: Tensor) -> Tensor:
     r"""The most that two samples would lose if each had the option that the other prefers.
@@ -56,17 +59,23 @@ def disagreement(predicted: Prediction, samples: Tensor) -> Tensor:
     preferences*, 2019. ω is the direction of a sample. How carefully the human answers makes no
     difference, and there are no gradients by the options: it changes in steps.
 
+    Most candidates have the same two samples in common. Of these that one is worth most in which
+    the two have most at stake (the difference of :func:`max_regret`, of these two alone): the
+    literature would plan the best trajectory of each, and this is the nearest that is there.
+
     Args:
         predicted: of the answers to C candidates, under M samples.
         samples: (… M D), the belief samples.
 
     Returns:
-        (… C), from 0 to 2; 0 where all samples prefer the same option, and where the options are
-        alike.
+        (… C), from 0 to 2, in double precision: what is at stake shows in digits beyond those of
+        the distance, and decides only between distances that are equal. 0 where all samples prefer
+        the same option, and where the options are alike.
     """
-    best = _best(_losses(predicted, samples))
+    losses = _losses(predicted, samples).detach()
+    best = _best(losses)
     apart, first, second = _farthest_first(directions(samples))
-    value = apart.new_zeros(best.shape[:-2])
+    found = torch.full(best.shape[:-2], -1, device=best.device)
     step = samples.shape[-2]
     for start in range(0, apart.shape[-1], step):
         block = slice(start, start + step)
@@ -75,11 +84,26 @@ def disagreement(predicted: Prediction, samples: Tensor) -> Tensor:
             for which in (first, second)
         )
         differ = ~(one & other).any(-1)
-        value = torch.maximum(value, (differ * apart[..., None, block]).amax(-1))
+        place = torch.where(differ.any(-1), start + differ.byte().argmax(-1), -1)
+        found = torch.where(found < 0, place, found)
         # Pairs that are further apart come first: whoever has found one is done.
-        if ((value > 0) | best.all(-2).any(-1)).all():
+        if ((found >= 0) | best.all(-2).any(-1)).all():
             break
-    return value
+    pair = found.clamp(min=0)
+    distance = apart.take_along_dim(pair, -1).double() * (found >= 0)
+    stake = _stake(losses, best, first.take_along_dim(pair, -1), second.take_along_dim(pair, -1))
+    return distance * (1 + BELOW * stake / (1 + stake))
+
+
+def _stake(losses: Tensor, best: Tensor, first: Tensor, second: Tensor) -> Tensor:
+    """What two samples (… C) would lose (… C), in double precision, if each had the option that the
+    other prefers, from losses and best options (… C M K)."""
+    lost = torch.zeros_like(losses[..., 0, 0], dtype=torch.double)
+    for one, other in ((first, second), (second, first)):
+        mine = losses.take_along_dim(one[..., None, None], -2)
+        theirs = best.take_along_dim(other[..., None, None], -2)
+        lost += mine.masked_fill(~theirs, 0).amax((-2, -1))
+    return lost
 
 
 def _losses(predicted: Prediction, samples: Tensor) -> Tensor:

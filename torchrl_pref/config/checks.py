@@ -178,16 +178,20 @@ def one_or_more(check: Check) -> Check:
     return check_all
 
 
-def none_or_more(check: Check) -> Check:
-    """The check of each in a list of different ones, which may be empty."""
+def list_of(*names: str) -> Check:
+    """A list of different ones of some words, which may be empty."""
 
-    def check_all(name: str, value: Any) -> None:
-        if not isinstance(value, list):
-            raise InputError(f"{name}={value!r}: expected a list, such as {name}=[{value}]")
-        if value:
-            one_or_more(check)(name, value)
+    def check(name: str, value: Any) -> None:
+        values = value if isinstance(value, list) else [value]
+        known = [one for one in names if one in values]
+        if values != value or len(known) < len(values):
+            example = ",".join(known or names[:1])
+            raise InputError(
+                f"{name}={value!s:.80}: expected a list of different ones of {', '.join(names)}, "
+                f"in brackets and quotes, as in '{name}=[{example}]', or '{name}=[]' for none"
+            )
 
-    return check_all
+    return check
 
 
 def count(minimum: int, maximum: int = LARGEST_COUNT) -> Check:

@@ -35,6 +35,9 @@ LAPLACE_COPIES = 6
 UNIFORMS = 18
 """Random numbers of a move, see ``beliefs.slice.MAX_SHRINKS``."""
 
+SHORTLIST = 20
+"""Candidates for each question of a batch, see ``strategies.batches``."""
+
 SHOWN = ("demonstrations.count", "demonstrations.alternatives")
 
 LIMIT_FILES = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
@@ -117,6 +120,10 @@ def parts_of(settings: Settings, *pool_shape: int) -> Iterator[Part]:
     each += 2.5 * max(offers, budget) * (16 * budget + 50)
     counts = "evaluation.humans" if settings.get("protocol") is None else "workers"
     yield Part("the evaluation", humans * each, (counts, *beliefs, *sizes))
+    batch = setup.get("batch", 1)
+    if batch > 1:
+        probs = min(n_queries, SHORTLIST * batch) * samples * sizes_of(settings, n_options)[0]
+        yield Part("choosing a batch", 24.0 * probs, ("setup.batch", "belief.samples", *sizes))
     yield from _belief_parts(settings, n_options, n_features)
 
 

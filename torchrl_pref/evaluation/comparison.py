@@ -131,7 +131,8 @@ def compare(
         runs.append((env, Entrant(key, policy.strategy, sample)))
     if own:
         env = _make_env(settings, task, pool, n_humans, seed)
-        runs += [(env, entrant) for entrant in make_own(own, env, seed)]
+        beside = [entrant.key for _, entrant in runs]
+        runs += [(env, entrant) for entrant in make_own(own, env, seed, beside)]
 
     exam = make_exam(settings, task, pool)
     results = {}

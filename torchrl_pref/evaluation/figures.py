@@ -27,7 +27,15 @@ from torchrl_pref.evaluation.style import (
     styles_of,
 )
 from torchrl_pref.evaluation.tables import counts, title_of
-from torchrl_pref.evaluation.views import alignment, curve, difference, reliability
+from torchrl_pref.evaluation.views import (
+    FEWEST,
+    alignment,
+    curve,
+    difference,
+    measured,
+    reliability,
+    units,
+)
 from torchrl_pref.storage.writing import replacing
 
 matplotlib.use("Agg")
@@ -48,14 +56,17 @@ def figure_1(records: Records, path: Path, metric: str = "alignment") -> None:
     for axis, task in zip(axes.flat, records.tasks, strict=False):
         own = records.of_task(task)
         for key in filter(is_drawn, own.strategies):
-            _draw(axis, key, own.values(key, metric), styles)
+            _draw(axis, key, measured(own, key, metric), styles, own.batch)
         axis.set(xlabel="queries asked", xlim=(0, None))
         _finish(axis)
     for row in axes:
         row[0].set_ylabel(METRICS[metric].axis)
     if metric == "alignment":
         axes[0, 0].set_ylim(top=1.02)
-    caption(figure, f"{counts(records.of_task(records.tasks[0]))}, bands are 95% intervals")
+    first = records.of_task(records.tasks[0])
+    together = units(first.values(first.strategies[0], metric)[..., -1]).numel() == 1
+    bands = "all together: no intervals" if together else "bands are 95% intervals"
+    caption(figure, f"{counts(first)}, {bands}")
     legend_above(figure, styles)
     save_figure(figure, path)
 
@@ -75,7 +86,11 @@ def reliability_figure(records: Records, path: Path) -> None:
         axis.grid(alpha=0.25)
     for row in axes:
         row[0].set_ylabel("how likely humans give it")
-    caption(figure, "after the last query, on questions that nobody asked; all humans together")
+    caption(
+        figure,
+        "after the last query, on questions that nobody asked; all humans together; "
+        f"bins of fewer than {FEWEST} answers are left out",
+    )
     legend_above(figure, styles)
     save_figure(figure, path)
 
@@ -138,13 +153,15 @@ def _draw_cell(above: Axes, below: Axes, records: Records, styles: Mapping[str, 
         below.set_ylabel(f"minus {name_of(baseline)}", fontsize="small")
 
 
-def _draw(axis: Axes, key: str, values: Tensor, styles: Mapping[str, Style]) -> None:
-    """Mean of curves (P S B H+1) by number of queries, and its 95% interval."""
+def _draw(
+    axis: Axes, key: str, values: Tensor, styles: Mapping[str, Style], batch: int = 1
+) -> None:
+    """Mean of curves (P S B J+1) by number of queries, so many at once, and its 95% interval."""
     means, bounds = curve(values)
     _, color, line = styles[key]
     # Dots go on top: a feed policy that asks everything lies exactly under "ask all".
     order = 3 if line == ":" else 2
-    queries = range(len(means))
+    queries = range(0, batch * len(means), batch)
     axis.plot(queries, means, color=color, linestyle=line, label=key, zorder=order)
     axis.fill_between(queries, bounds[:, 0], bounds[:, 1], color=color, alpha=0.15, lw=0)
 

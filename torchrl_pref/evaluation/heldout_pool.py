@@ -44,6 +44,7 @@ from torchrl_pref.strategies import (
     RandomQuery,
     ThresholdAsk,
 )
+from torchrl_pref.strategies.lookahead import MOST_FOLLOWED
 
 HUMANS = 100
 
@@ -129,8 +130,9 @@ def run_pool(job: Job) -> list[Entry]:
     make_env = partial(_make_env, job, task, pool, seed)
     env = make_env(HUMANS)
     humans = draw_humans(env)
-    judged = _judged(job, env, seed)
-    lineup = [*_lineup(job, task, env, seed), *judged]
+    baselines = _lineup(job, task, env, seed)
+    judged = _judged(job, env, seed, [entrant.key for entrant in baselines])
+    lineup = [*baselines, *judged]
     torch.manual_seed(seed)  # of policies that draw their actions
     exam = make_exam(job.settings, task, pool)
     results = run_side_by_side(make_env, humans, lineup, exam)
@@ -145,7 +147,9 @@ def run_pool(job: Job) -> list[Entry]:
         fine = partial(make_env, settings={**job.settings, "belief": belief})
         key = f"greedy_many_samples:M={FINE_SAMPLES}"
         few = humans[:FINE_HUMANS].select("human")
-        results |= run_side_by_side(fine, few, [Entrant(key, greedy)], exam)
+        # A calibration error is the larger, the fewer the humans: theirs would say nothing.
+        of_few = exam and exam.without("calibration")
+        results |= run_side_by_side(fine, few, [Entrant(key, greedy)], of_few)
     last = dict.fromkeys(entrant.key for entrant in judged)  # their rows come last
     entries = []
     for key in [*(key for key in results if key not in last), *last]:
@@ -190,14 +194,14 @@ def try_job(job: Job) -> None:
     try_own(find_makers(job.own), env)
 
 
-def _judged(job: Job, env: QueryEnv | FeedEnv, seed: int) -> list[Entrant]:
-    """The policies, and the strategies of the user."""
+def _judged(job: Job, env: QueryEnv | FeedEnv, seed: int, beside: Sequence[str]) -> list[Entrant]:
+    """The policies, and the strategies of the user that are no baselines beside them."""
     policies = [
         Entrant(key, load_policy(one, env).strategy, one.settings["policy"]["sample"])
         for key, checkpoints in job.learned.items()
         for one in checkpoints
     ]
-    return [*policies, *make_own(find_makers(job.own), env, seed)]
+    return [*policies, *make_own(find_makers(job.own), env, seed, beside)]
 
 
 def _lineup(job: Job, task: Problem, env: QueryEnv | FeedEnv, seed: int) -> list[Entrant]:
@@ -229,7 +233,7 @@ def _baselines(
     }
     if job.cell.features != "balanced":
         strategies["volume_removal"] = Greedy(model, volume_removal)
-    if job.cell.features == "corners":
+    if job.cell.features == "corners" and env.n_answers**2 <= MOST_FOLLOWED:
         strategies["lookahead"] = Lookahead(model)
     return strategies
 

@@ -30,8 +30,10 @@ from torchrl_pref.tensors import directions
 QUESTIONS = 100
 """N: with more, evaluations would get slower by more than a tenth."""
 
-BINS = 10
-"""G, of the probability that an answer was predicted to have."""
+BINS = 9
+"""G, of the probability that an answer was predicted to have. Odd, so that ½ is the middle of one
+and not where two meet: who knows nothing predicts it, and M samples scatter about it, by about .05
+where M is 100. Narrower bins would tell those apart that differ by this luck alone."""
 
 PARTS = ("answers", "predicted", "given")
 """Of a bin of :func:`reliability`."""
@@ -53,6 +55,17 @@ class Exam:
     trajectories: Tensor
     metrics: tuple[str, ...]
 
+    def ranks(self, omega: Tensor) -> Tensor | None:
+        """(B T), of the trajectories' rewards to humans (B D): told once, as sorting them takes
+        longer than all else, and no answer changes them. None: no metric looks at them."""
+        if "rank_correlation" not in self.metrics:
+            return None
+        return _centred_ranks(omega @ self.trajectories.mT)
+
+    def without(self, name: str) -> Exam:
+        """The same, but for one metric."""
+        return replace(self, metrics=tuple(each for each in self.metrics if each != name))
+
     def to(self, device: torch.device) -> Exam:
         """The same on a device."""
         return replace(
@@ -73,6 +86,8 @@ class Standing:
         answers: (B N R), how likely the humans give each answer to the questions.
         exam: the questions.
         response_model: how the belief thinks that people answer.
+        ranks: (B T), of the trajectories' rewards to the humans where they are known already, see
+            :meth:`Exam.ranks`.
     """
 
     samples: Tensor
@@ -80,6 +95,7 @@ class Standing:
     answers: Tensor
     exam: Exam
     response_model: ResponseModel
+    ranks: Tensor | None = None
 
     @cached_property
     def predicted(self) -> Tensor:
@@ -130,7 +146,8 @@ def regret(standing: Standing) -> Tensor:
 def rank_correlation(standing: Standing) -> Tensor:
     """(B), Spearman's between the trajectories' rewards to the human and as the belief expects;
     0 where one of them is the same for all."""
-    true, learned = (_centred_ranks(rewards) for rewards in standing.rewards)
+    true, learned = standing.ranks, _centred_ranks(standing.rewards[1])
+    true = _centred_ranks(standing.rewards[0]) if true is None else true
     lengths = (true.square().sum(-1) * learned.square().sum(-1)).sqrt()
     return (true * learned).sum(-1) / lengths.clamp(min=1e-12)
 
@@ -146,33 +163,33 @@ def _centred_ranks(values: Tensor) -> Tensor:
 def reliability(standing: Standing) -> Tensor:
     """(B 3G), answers by how likely they were predicted to be, in G bins of equal width.
 
-    Of each bin the share of all answers that fall into it, the sum of what was predicted of them,
-    and of how likely the human gives them; both over the number of all answers.
+    Of each bin the number of answers that fall into it, the sum of what was predicted of them, and
+    of how likely the human gives them.
     """
     predicted, given = (each.flatten(1) for each in (standing.predicted, standing.answers))
     bins = (predicted * BINS).long().clamp(0, BINS - 1)
     empty = predicted.new_zeros(len(predicted), BINS)
     parts = (torch.ones_like(predicted), predicted, given)
     sums = [empty.scatter_add(1, bins, part) for part in parts]
-    return torch.cat(sums, -1) / predicted.shape[1]
+    return torch.cat(sums, -1)
 
 
 def calibration(reliabilities: Tensor) -> Tensor:
-    r"""(B …), each human's part of the expected calibration error of all B.
+    r"""(…), the expected calibration error of all B humans together.
 
     .. math:: \sum_g \frac{n_g}{n} \lvert \bar p_g - \bar q_g \rvert
 
     over bins g of all humans' answers together (Naeini, Cooper and Hauskrecht, *Obtaining well
     calibrated probabilities using Bayesian binning*, 2015), where q is how likely the human gives
-    the answer. Of a single human a calibrated belief errs as well, either way: a part is signed as
-    the error of all is, and the mean of the parts is that error.
+    the answer. Of a single human a calibrated belief errs as well, either way: no human has a part
+    of it.
 
     Args:
         reliabilities: (B … 3G), of :func:`reliability`.
     """
-    _, predicted, given = reliabilities.unflatten(-1, (len(PARTS), BINS)).unbind(-2)
-    gaps = predicted - given
-    return (gaps * gaps.mean(0).sign()).sum(-1)
+    parts = reliabilities.sum(0).unflatten(-1, (len(PARTS), BINS))
+    answers, predicted, given = parts.unbind(-2)
+    return (predicted - given).abs().sum(-1) / answers.sum(-1)
 
 
 class Metric(NamedTuple):

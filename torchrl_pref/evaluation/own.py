@@ -21,8 +21,10 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
+from torchrl_pref.envs.session import is_feed
 from torchrl_pref.errors import InputError
 from torchrl_pref.evaluation.side_by_side import Entrant
+from torchrl_pref.evaluation.style import is_there
 from torchrl_pref.groups import load, where
 from torchrl_pref.strategies import make_strategy
 
@@ -47,14 +49,22 @@ def find_makers(typed: Sequence[str]) -> dict[str, Maker]:
     }
 
 
-def make_own(makers: Mapping[str, Maker], env: QueryEnv | FeedEnv, seed: int) -> list[Entrant]:
-    """The strategies, each made for an environment, with a generator seeded alike.
+def make_own(
+    makers: Mapping[str, Maker],
+    env: QueryEnv | FeedEnv,
+    seed: int,
+    beside: Sequence[str] = (),
+) -> list[Entrant]:
+    """The strategies, each made for an environment, with a generator seeded alike; but for those
+    that are beside them already, as baselines with these keys.
 
     Raises:
         InputError: making one fails, or makes something else.
     """
     entrants = []
     for typed, maker in makers.items():
+        if is_there(typed, is_feed(env), beside):
+            continue
         torch.manual_seed(seed)
         try:
             strategy = maker(env)

@@ -45,7 +45,11 @@ metric beside alignment. pandas, polars and R read it as it is."""
 
 
 RELIABILITY = tuple(f"{part}_in_bin_{place}" for part in PARTS for place in range(BINS))
-"""Metrics of all humans together after the last answer, see ``metrics.reliability``."""
+"""Sums over all humans after the last answer, see ``metrics.reliability``."""
+
+
+AT_ONCE = "asked_at_once"
+"""How many queries a strategy asked at once, where it was more than one."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +63,7 @@ class Entry:
         seed: of the policy's training, or the number of the run of a baseline.
         strategy: its key, see ``style.py``.
         values: by metric (B H+1) where there is one after each number of answers, (B) of a
-            session, or () of all together.
+            session; of all humans together, who are at least two, (1 H+1) or ().
     """
 
     protocol: str
@@ -74,7 +78,7 @@ class Entry:
         for metric, values in self.values.items():
             table = values.reshape(len(values) if values.ndim else 1, -1).tolist()
             for human, row in enumerate(table):
-                who = human if values.ndim else None
+                who = human if len(table) > 1 else None
                 for query, value in enumerate(row):
                     of = (self.protocol, self.task, self.pool, who, self.seed, self.strategy)
                     yield (*of, query if values.ndim == 2 else None, metric, value)
@@ -100,6 +104,16 @@ class Records:
     def metrics(self) -> list[str]:
         """What was measured, in order."""
         return list(dict.fromkeys(name for entry in self.entries for name in entry.values))
+
+    @property
+    def batch(self) -> int:
+        """How many queries were asked at once. Between two multiples of it nothing is learned, and
+        values after so many answers are those of before: no table or figure counts them."""
+        return max((int(one.values.get(AT_ONCE, 1)) for one in self.entries), default=1)
+
+    def has(self, strategy: str, metric: str) -> bool:
+        """Whether a metric was measured of a strategy in the one task that is there."""
+        return any(metric in one.values for one in self.entries if one.strategy == strategy)
 
     def of_task(self, task: str) -> Records:
         """What belongs to one task."""
@@ -134,9 +148,11 @@ def entry_of(evaluation: Evaluation, curves: Iterable[str], seconds: str, **iden
         if isinstance(value, Tensor):
             last = value.ndim == 2 and name not in (*curves, *evaluation.examined)
             values[name] = (value[:, -1] if last else value).float().clone()
+    if evaluation.batch > 1:
+        values[AT_ONCE] = torch.tensor(float(evaluation.batch))
     values[seconds] = torch.tensor(evaluation.seconds_per_query)
     if "calibration" in evaluation.examined:
-        bins = evaluation.examined["calibration"][:, -1].mean(0)
+        bins = evaluation.examined["calibration"][:, -1].sum(0)
         values |= dict(zip(RELIABILITY, bins, strict=True))
     return Entry(values=values, **identity)
 
@@ -207,8 +223,8 @@ def read_records(path: str | Path) -> Records:
 
 
 def _tensor(by_human: Mapping[str, list[float]]) -> Tensor:
-    """(B H+1), (B) or (), from the numbers of each human; "" is all together."""
+    """(B H+1), (B), (1 H+1) or (), from the numbers of each human; "" is all together."""
     values = torch.tensor(list(by_human.values()))
-    if "" in by_human:
-        return values[0, 0]
-    return values if values.shape[1] > 1 else values.squeeze(-1)
+    if values.shape[1] > 1:
+        return values
+    return values[0, 0] if "" in by_human else values.squeeze(-1)

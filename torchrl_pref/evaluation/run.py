@@ -39,6 +39,7 @@ class Evaluation:
         seconds_per_query: wall time of the whole session (choice, answer, belief) over the queries
             asked of all B humans; measuring what was asked for beside alignment is not in it.
         examined: (B H+1 …), the metrics that were asked for, as they were measured.
+        batch: how many queries were asked at once.
 
     Where a session ended before j answers, column j holds its last value.
     """
@@ -52,12 +53,14 @@ class Evaluation:
     repeated: Tensor
     seconds_per_query: float
     examined: Mapping[str, Tensor] = field(default_factory=dict)
+    batch: int = 1
 
     @property
     def metrics(self) -> dict[str, Tensor]:
-        """The metrics that were asked for beside alignment, by name (B H+1)."""
+        """The metrics that were asked for beside alignment, by name (B H+1); of what is told of all
+        humans together (1 H+1)."""
         return {
-            name: calibration(values) if name == "calibration" else values.squeeze(-1)
+            name: calibration(values)[None] if name == "calibration" else values.squeeze(-1)
             for name, values in self.examined.items()
         }
 
@@ -79,7 +82,7 @@ class Examiner:
             human = session["human"]
             self.model, self.omega = env.belief.response_model, human["omega"]
             self.exam = exam = exam.to(self.omega.device)
-            seen = exam.seen.to(self.omega)
+            seen, self.ranks = exam.seen.to(self.omega), exam.ranks(self.omega)
             self.answers = env.human.log_probs(seen.expand(len(human), *seen.shape), human).exp()
 
     def __call__(self, session: TensorDictBase) -> dict[str, Tensor]:
@@ -91,9 +94,9 @@ class Examiner:
         if not len(who):
             return self.values
         start = time.perf_counter()
-        standing = Standing(
-            *(kept["samples"][who], self.omega[who], self.answers[who]), self.exam, self.model
-        )
+        ranks = None if self.ranks is None else self.ranks[who]
+        of_them = kept["samples"][who], self.omega[who], self.answers[who]
+        standing = Standing(*of_them, self.exam, self.model, ranks)
         for name, values in measure(self.exam.metrics, standing).items():
             before = self.values.get(name, values)
             self.values[name] = before.index_copy(0, who, values)
@@ -155,6 +158,7 @@ def evaluate(
         offered=offered,
         repeated=_count_repeats(history),
         seconds_per_query=seconds / max(1, int(asked.sum())),
+        batch=env.batch,
     )
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -84,7 +84,9 @@ def run_side_by_side(
     results: dict[str, list[Evaluation]] = {}
     for number, entrant in enumerate(entrants):
         rows = slice(number * count, (number + 1) * count)
-        own = {key: value[rows] for key, value in vars(whole).items() if isinstance(value, Tensor)}
+        own: dict[str, Any] = {
+            key: value[rows] for key, value in vars(whole).items() if isinstance(value, Tensor)
+        }
         examined = {name: values[rows] for name, values in whole.examined.items()}
         seconds = chorus.seconds[number] / max(1, int(own["asked"].sum()))
         result = replace(whole, **own, examined=examined, seconds_per_query=seconds)

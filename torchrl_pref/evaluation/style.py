@@ -35,52 +35,68 @@ class Kind(NamedTuple):
     """The kind that it has to be better than: what it is held against in tables."""
     drawn: bool = True
     """Whether figures of many strategies show it; tables show all."""
+    typed: str | None = None
+    """What ``strategy=`` calls the same in its setup, where it has a name for it."""
 
 
 KINDS: dict[str, Kind] = {
-    "random": Kind(Style("random", "#7f7f7f", "--")),
-    "greedy_information": Kind(Style("greedy information gain", "#1f1f1f", "-"), baseline="random"),
+    "random": Kind(Style("random", "#7f7f7f", "--"), typed="random"),
+    "greedy_information": Kind(
+        Style("information_gain", "#1f1f1f", "-"), baseline="random", typed="information_gain"
+    ),
     "greedy_many_samples": Kind(
-        Style("greedy information gain", "#1f1f1f", ":"),
+        Style("information_gain", "#1f1f1f", ":"),
         baseline="greedy_information",
         drawn=False,
     ),
     "greedy_no_repeats": Kind(
-        Style("greedy information gain, no repeats", "#1f1f1f", "--"),
+        Style("information_gain, no repeats", "#1f1f1f", "--"),
         baseline="greedy_information",
         drawn=False,
     ),
     "lookahead": Kind(
-        Style("two-step lookahead", "#8c510a", "-"), baseline="greedy_information", drawn=False
+        Style("lookahead", "#8c510a", "-"),
+        baseline="greedy_information",
+        drawn=False,
+        typed="lookahead",
     ),
     "volume_removal": Kind(
-        Style("volume removal", "#8c510a", "--"), baseline="greedy_information", drawn=False
+        Style("volume_removal", "#8c510a", "--"),
+        baseline="greedy_information",
+        drawn=False,
+        typed="volume_removal",
     ),
     "greedy_alignment": Kind(
-        Style("greedy alignment", "#009e73", "-"), baseline="greedy_information"
+        Style("alignment_gain", "#009e73", "-"),
+        baseline="greedy_information",
+        typed="alignment_gain",
     ),
-    "batch_top": Kind(Style("the best at once", "#1f1f1f", "--"), batch=True, baseline="random"),
+    "batch_top": Kind(Style("top", "#1f1f1f", "--"), batch=True, baseline="random"),
     "batch_medoids": Kind(Style("medoids", "#8c510a", "-"), batch=True, baseline="batch_top"),
     "batch_boundary_medoids": Kind(
-        Style("boundary medoids", "#e69f00", "-"), batch=True, baseline="batch_top"
+        Style("boundary_medoids", "#e69f00", "-"), batch=True, baseline="batch_top"
     ),
     "batch_successive_elimination": Kind(
-        Style("successive elimination", "#0072b2", "-."), batch=True, baseline="batch_top"
+        Style("successive_elimination", "#0072b2", "-."), batch=True, baseline="batch_top"
     ),
-    "batch_dpp": Kind(Style("DPP", "#cc79a7", "-"), batch=True, baseline="batch_top"),
-    "batch_joint": Kind(
-        Style("joint information", "#009e73", "-."), batch=True, baseline="batch_top"
-    ),
-    "ask_all": Kind(Style("ask all", "#000000", ":"), feed=True),
+    "batch_dpp": Kind(Style("dpp", "#cc79a7", "-"), batch=True, baseline="batch_top"),
+    "batch_joint": Kind(Style("joint", "#009e73", "-."), batch=True, baseline="batch_top"),
+    "ask_all": Kind(Style("ask all", "#000000", ":"), feed=True, typed="random"),
     "threshold": Kind(Style("threshold in bits", "#e69f00", "-."), feed=True, baseline="ask_all"),
     "quantile_information": Kind(
-        Style("quantile of information", "#5e3c99", "-."), feed=True, baseline="ask_all"
+        Style("information_gain, feed", "#5e3c99", "-."),
+        feed=True,
+        baseline="ask_all",
+        typed="information_gain",
     ),
     "quantile_alignment": Kind(
-        Style("quantile of alignment", "#cc79a7", "-."), feed=True, baseline="ask_all"
+        Style("alignment_gain, feed", "#cc79a7", "-."),
+        feed=True,
+        baseline="ask_all",
+        typed="alignment_gain",
     ),
     "quantile_both": Kind(
-        Style("quantile, information then alignment", "#882255", "--"),
+        Style("information_gain then alignment_gain, feed", "#882255", "--"),
         feed=True,
         baseline="quantile_alignment",
         drawn=False,
@@ -91,7 +107,8 @@ KINDS: dict[str, Kind] = {
     "own": Kind(Style("own", "#aa4499", "-")),
 }
 """By kind. The colours begin with Okabe and Ito's, told apart by colour-blind readers; ``RL`` and
-``RL-feed`` are the paper's names; ``own`` are strategies of the user, in either setup."""
+``RL-feed`` are the paper's names; ``own`` are strategies of the user, in either setup. Names are
+those that ``strategy=`` has, where it has one."""
 
 SPARE = (
     ("#aa4499", "-"),
@@ -133,6 +150,12 @@ def is_feed(key: str, beside: Iterable[str]) -> bool:
     """Whether a strategy decides on offers; one of the user does where others beside it do."""
     kinds = [kind_of(key)] if kind_of(key) != "own" else map(kind_of, beside)
     return any(KINDS[kind].feed for kind in kinds)
+
+
+def is_there(typed: str, feed: bool, beside: Iterable[str]) -> bool:
+    """Whether what ``strategy=`` calls so, in a feed or not, is a baseline beside it already."""
+    kinds = [KINDS[kind_of(key)] for key in beside]
+    return any(kind.typed == typed and kind.feed == feed for kind in kinds)
 
 
 def baseline_of(key: str, beside: Iterable[str]) -> str | None:

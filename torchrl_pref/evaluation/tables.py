@@ -13,7 +13,6 @@ from torch import Tensor
 from torchrl_pref.evaluation.metrics import METRICS
 from torchrl_pref.evaluation.records import Records
 from torchrl_pref.evaluation.style import (
-    KINDS,
     LEARNED,
     baseline_of,
     is_feed,
@@ -27,6 +26,7 @@ from torchrl_pref.evaluation.views import (
     comparisons,
     difference,
     mean_and_interval,
+    measured,
     milestones,
 )
 
@@ -83,12 +83,12 @@ def alignment_table(records: Records, style: str = "simple") -> str:
     rows = []
     for key in records.strategies:
         values = alignment(records, key)
-        budget = values.shape[-1] - 1
+        last, each = values.shape[-1] - 1, records.batch
         interval = mean_and_interval(values[..., -1])[1:]
         row = {"strategy": name_of(key)}
-        row |= {f"after {j}": f"{values[..., j].mean():.3f}" for j in milestones(budget)}
-        row[f"mean of 1 to {budget}"] = f"{values[..., 1:].mean():.3f}"
-        row[f"after {budget} [95%]"] = "[{:.3f}, {:.3f}]".format(*interval)
+        row |= {f"after {each * j}": f"{values[..., j].mean():.3f}" for j in milestones(last)}
+        row[f"mean of {each} to {each * last}"] = f"{values[..., 1:].mean():.3f}"
+        row[f"after {each * last} [95%]"] = "[{:.3f}, {:.3f}]".format(*interval)
         other = baseline_of(key, records.strategies)
         row["held against"] = "" if other is None else name_of(other)
         row["minus that [95%]"] = "" if other is None else _difference(records, key, other)
@@ -98,7 +98,8 @@ def alignment_table(records: Records, style: str = "simple") -> str:
 
 def difference_table(records: Records, style: str = "simple") -> str:
     """Paired differences of policies and strategies of the user to all others, one a row."""
-    budget = alignment(records, records.strategies[0]).shape[-1] - 1
+    each = records.batch
+    budget = each * (alignment(records, records.strategies[0]).shape[-1] - 1)
     rows = []
     for key, other in comparisons(records):
         rows.append(
@@ -106,7 +107,7 @@ def difference_table(records: Records, style: str = "simple") -> str:
                 "strategy": name_of(key),
                 "minus": name_of(other),
                 f"after {budget}": _difference(records, key, other),
-                f"mean of 1 to {budget}": _difference(records, key, other, on_the_way=True),
+                f"mean of {each} to {budget}": _difference(records, key, other, on_the_way=True),
             }
         )
     return tabulate(rows, headers="keys", tablefmt=style, disable_numparse=True)
@@ -128,7 +129,8 @@ def detail_table(records: Records, style: str = "simple") -> str:
             row[f"reaches {level:.3f}"] = answers_to_reach(records, key, level)
         for metric, (header, show) in DETAILS.items():
             if metric in records.metrics:
-                row[header] = show(records.values(key, metric))
+                there = records.has(key, metric)
+                row[header] = show(measured(records, key, metric)) if there else ""
         rows.append(row)
     return tabulate(rows, headers="keys", tablefmt=style, disable_numparse=True)
 
@@ -167,9 +169,9 @@ def feed_note(records: Records) -> list[str]:
 
 def batch_note(records: Records) -> list[str]:
     """What a number of answers means where queries are asked several at once."""
-    if not any(KINDS[kind_of(key)].batch for key in records.strategies):
+    if records.batch == 1:
         return []
-    return ["queries are asked in batches: until the last answer of one, nothing is learned", ""]
+    return [f"queries are asked in batches of {records.batch}: numbers are of after each", ""]
 
 
 def few_samples(records: Records) -> list[str]:

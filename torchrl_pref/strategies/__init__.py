@@ -21,7 +21,7 @@ from torchrl_pref.envs.session import is_feed
 from torchrl_pref.errors import check_choice
 from torchrl_pref.strategies.batches import BatchOf
 from torchrl_pref.strategies.feed import OfferRank, QuantileAsk, RandomAsk, ThresholdAsk
-from torchrl_pref.strategies.lookahead import AlignmentLookahead, Lookahead
+from torchrl_pref.strategies.lookahead import AlignmentLookahead, Lookahead, check_followed
 from torchrl_pref.strategies.query import Greedy, RandomQuery, Thompson
 
 __all__ = [
@@ -53,6 +53,14 @@ def _by_knowledge(env: EnvBase) -> Acquisition:
     return KnowledgeGradient(env.features.flatten(0, 1))
 
 
+def _looking_ahead(
+    env: EnvBase, kind: type[Lookahead] | type[AlignmentLookahead]
+) -> TensorDictModuleBase:
+    """What looks ahead in an environment, refused where its questions have too many answers."""
+    check_followed(env.belief.response_model, env.features.shape[1])
+    return kind(env.belief.response_model)
+
+
 def _batch_of(env: EnvBase, select: Select) -> TensorDictModuleBase:
     """What asks batches in an environment."""
     return BatchOf(env.belief.response_model, env.batch, select)
@@ -66,8 +74,8 @@ STRATEGIES: dict[str, MakeStrategy] = {
     **{name: partial(_greedy, acquisition=each) for name, each in ACQUISITIONS.items()},
     "knowledge_gradient": lambda env: _greedy(env, _by_knowledge(env)),
     "thompson": lambda env: Thompson(_greedy(env, max_regret)),
-    "lookahead": lambda env: Lookahead(env.belief.response_model),
-    "alignment_lookahead": lambda env: AlignmentLookahead(env.belief.response_model),
+    "lookahead": partial(_looking_ahead, kind=Lookahead),
+    "alignment_lookahead": partial(_looking_ahead, kind=AlignmentLookahead),
 }
 """Strategies that choose from candidates, by name: greedy ones by that of what they maximise."""
 

@@ -57,6 +57,7 @@ class BatchOf(TensorDictModuleBase):
         values, order = values.masked_fill(~mask, -math.inf).sort(
             dim=-1, descending=True, stable=True
         )
+        threshold = threshold_of(self.response_model) if queries.shape[2] == 1 else 0.0
         length = min(self.shortlist * self.batch, order.shape[1])
         actions = []
         # One session at a time: what is chosen next depends on what was chosen before.
@@ -64,8 +65,12 @@ class BatchOf(TensorDictModuleBase):
             best = order[b, : min(length, allowed)]
             shown = queries[b, best]
             predicted = predict_answers(samples[b : b + 1], shown.unsqueeze(0), self.response_model)
-            chosen = self.select(
-                Shortlist(values[b, : len(best)], shown, predicted.probs[0]), self.batch
-            )
-            actions.append(best[chosen])
+            told = values[b, : len(best)], shown, predicted.probs[0], threshold
+            actions.append(best[self.select(Shortlist(*told), self.batch)])
         return tensordict.set("action", torch.stack(actions))
+
+
+def threshold_of(response_model: ResponseModel) -> float:
+    """The return that one option has to exceed, of a question whether it is good."""
+    (_, offsets, _), _ = response_model.tables(1, torch.device("cpu"))
+    return float(offsets[offsets.isfinite()].abs().max()) / response_model.scale

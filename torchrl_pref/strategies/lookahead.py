@@ -17,12 +17,30 @@ from torch import Tensor
 from torchrl_pref.acquisition.functions import information_gain
 from torchrl_pref.acquisition.scoring import predict_answers
 from torchrl_pref.envs.transition import OPEN
-from torchrl_pref.errors import check_count
+from torchrl_pref.errors import InputError, check_count
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.tensors import directions
 
 HELD = 4_000_000
 """Numbers (G D+1 C R) held at once: bounds memory."""
+
+MOST_FOLLOWED = 1000
+"""Sequences of answers to a sequence of questions, all of which are followed: bounds time."""
+
+
+def check_followed(response_model: ResponseModel, n_options: int, steps: int = 2) -> None:
+    """Refuse to look ahead at questions with so many answers that it would take minutes or more.
+
+    Raises:
+        InputError: there are too many.
+    """
+    n_answers = response_model.n_answers(n_options)
+    if n_answers**steps > MOST_FOLLOWED:
+        raise InputError(
+            f"looking {steps} questions ahead, each with {n_answers} answers: there are "
+            f"{n_answers**steps} sequences of answers to follow; expected at most {MOST_FOLLOWED}; "
+            "ask about fewer options, look fewer questions ahead, or choose by alignment_gain"
+        )
 
 
 class OneByOne(TensorDictModuleBase, ABC):
@@ -31,21 +49,23 @@ class OneByOne(TensorDictModuleBase, ABC):
     Args:
         response_model: how the belief thinks the human answers.
         beam: first questions to follow.
+        steps: questions to look ahead.
 
     Raises:
-        InputError: the beam is below 1.
+        InputError: a number is below 1.
     """
 
     in_keys = ["samples", "queries", "action_mask", ("session", "history", "answers")]
     out_keys = ["action"]
 
-    def __init__(self, response_model: ResponseModel, beam: int) -> None:
+    def __init__(self, response_model: ResponseModel, beam: int, steps: int) -> None:
         super().__init__()
         self.response_model = response_model
-        self.beam = check_count("beam", beam, 1)
+        self.beam, self.steps = check_count("beam", beam, 1), check_count("steps", steps, 1)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``action`` (B)."""
+        """Write ``action`` (B). An InputError where the questions have too many answers."""
+        check_followed(self.response_model, tensordict["queries"].shape[2], self.steps)
         actions = [self._choose(session) for session in tensordict.select(*self.in_keys).unbind(0)]
         return tensordict.set("action", torch.stack(actions))
 
@@ -66,7 +86,7 @@ class Lookahead(OneByOne):
     """
 
     def __init__(self, response_model: ResponseModel, beam: int = 20) -> None:
-        super().__init__(response_model, beam)
+        super().__init__(response_model, beam, steps=2)
 
     def _choose(self, session: TensorDictBase) -> Tensor:
         samples = session["samples"].unsqueeze(0)
@@ -107,8 +127,7 @@ class AlignmentLookahead(OneByOne):
     """
 
     def __init__(self, response_model: ResponseModel, steps: int = 2, beam: int = 25) -> None:
-        super().__init__(response_model, beam)
-        self.steps = check_count("steps", steps, 1)
+        super().__init__(response_model, beam, steps)
 
     def _choose(self, session: TensorDictBase) -> Tensor:
         samples = session["samples"]

@@ -384,6 +384,15 @@ PARTS: dict[str, Part] = {
         pictures,
     ),
     "room": measured("room", "docs/strategies.md", 40),
+    "room_feed": Part(
+        "docs/strategies.md",
+        (
+            "python benchmarks/room.py --setup feed --json {folder}/room_feed.json "
+            "-> room_feed.json",
+        ),
+        40,
+        benchmark("room_feed"),
+    ),
     "large_pool": measured("large_pool", "docs/speed.md", 1),
     "aprel": Part(
         "docs/aprel.md",

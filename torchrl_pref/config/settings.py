@@ -211,12 +211,6 @@ def check_run(settings: Plain) -> Settings:
     refuse_batches(own, "a policy that is learned")
     check_together(own)
     check_drawn(own)
-    setup, policy = own["setup"], own["policy"]
-    if setup["name"] == "feed" and policy.get("start") is not None:
-        raise InputError(
-            f"policy.start={policy['start']}: in the feed the scorer starts from the quantile "
-            "rule; leave policy.start out, or set setup=query"
-        )
     checked = cast(Settings, settings)
     check_memory(checked)
     return checked

@@ -16,13 +16,18 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 from torchrl.modules import MLP
 
-from torchrl_pref.acquisition.functions import alignment_gain, information_gain, volume_removal
+from torchrl_pref.acquisition.functions import (
+    Acquisition,
+    alignment_gain,
+    information_gain,
+    volume_removal,
+)
 from torchrl_pref.acquisition.scoring import score_queries, standardise, together
 from torchrl_pref.beliefs.per_belief import PerBelief
 from torchrl_pref.beliefs.resampling import covariance_of
 from torchrl_pref.envs.objectives import OBJECTIVES
 from torchrl_pref.envs.session import is_feed
-from torchrl_pref.errors import InputError, check_choice
+from torchrl_pref.errors import check_choice
 from torchrl_pref.policies.base import (
     N_BELIEF,
     Layer,
@@ -82,6 +87,10 @@ class CandidateFeatures(nn.Module):
             [gain, alignment, removal, variance.clamp(min=0).sqrt(), variance, apart, length],
             -1,
         )
+
+
+GREEDY: tuple[Acquisition, ...] = (information_gain, alignment_gain)
+"""What greedy strategies ask by, in the order of the candidate features."""
 
 
 def greedy_feature(objective: str) -> int:
@@ -150,18 +159,20 @@ class OfferScorer(nn.Module):
 class OfferFeatures(nn.Module):
     """The features of the one offered query, and its rank among a reference sample of the pool.
 
-    The rank is by information gain at the first ask, and all but 1/H by expected alignment gain at
-    the last.
-
     Args:
         env: gives the response model, the pool and the budgets.
+        start: the objective by whose greedy score it is ranked; None: by information gain at the
+            first ask, and all but 1/H by expected alignment gain at the last.
     """
 
-    def __init__(self, env: EnvBase) -> None:
+    def __init__(self, env: EnvBase, start: str | None = None) -> None:
         super().__init__()
         self.features = CandidateFeatures(env.belief.response_model)
         self.budget, self.n_offers = env.budget, env.n_offers
-        self.rank = OfferRank(env, information_gain, late=alignment_gain)
+        if start is None:
+            self.rank = OfferRank(env, information_gain, late=alignment_gain)
+        else:
+            self.rank = OfferRank(env, GREEDY[greedy_feature(start)])
         self.unsure = PerBelief(_unsure)
 
     def forward(
@@ -205,11 +216,12 @@ def scorer_policy(env: EnvBase, start: str | None = None) -> Policy:
 
     Args:
         env: gives the response model of the belief, the objective and the kind of decision.
-        start: the objective whose greedy strategy it starts from in the query setup; by default the
-            environment's own. In the feed it starts from the quantile rule.
+        start: the objective whose greedy strategy it starts from, in a feed its quantile rule. By
+            default it is the environment's own, and in a feed information gain first and alignment
+            last.
 
     Raises:
-        InputError: there is no such objective, or ``start`` is given for a feed.
+        InputError: there is no such objective.
     """
     device = torch.device(env.device)
     n_shares = env.observation_spec["remaining"].shape[-1]
@@ -222,13 +234,8 @@ def scorer_policy(env: EnvBase, start: str | None = None) -> Policy:
         greedy = greedy_feature(env.objective if start is None else start)
         network: nn.Module = QueryScorer(greedy, n_shares, device)
     else:
-        if start is not None:
-            raise InputError(
-                f"policy.start={start}: in the feed the scorer starts from the quantile rule; "
-                "leave policy.start out, or set setup=query"
-            )
         features = Layer(
-            OfferFeatures(env),
+            OfferFeatures(env, start),
             in_keys=["samples", "offer", "n_asked", "n_offered"],
             out_keys=["offer_features", "rank", "share", "urgency"],
         )

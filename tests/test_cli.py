@@ -306,7 +306,6 @@ BAD_INPUT = [
     ("train", "objective=fun", "objective='fun': expected one of information_gain, alignment"),
     ("train", "skip=always", "skip='always': expected one of regret, free"),
     ("train", "setup=query policy.start=fun", "policy.start='fun': expected one of"),
-    ("train", "policy.start=alignment", "starts from the quantile rule; leave policy.start out"),
     ("train", "policy=attention policy.tokens=all", "policy.tokens='all': expected one of"),
     ("train", "human.spread=0.5", "human.spread=0.5: expected a factor of at least 1"),
     ("train", "training.warm_up=-1", "training.warm_up=-1: expected a whole number"),

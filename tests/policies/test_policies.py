@@ -81,13 +81,22 @@ def test_scorer_starts_as_the_greedy_strategy_of_its_objective(
     assert torch.allclose(forecast[rows, chosen], forecast.amax(1), atol=1e-5)
 
 
+RULES = {
+    None: (information_gain, alignment_gain),
+    "information_gain": (information_gain, None),
+    "alignment": (alignment_gain, None),
+}
+
+
+@pytest.mark.parametrize("start", RULES)
 @pytest.mark.parametrize("model", RESPONSE_MODELS, ids=str)
-def test_offer_scorer_starts_as_the_quantile_rule(model: ResponseModel, pool: QueryPool) -> None:
+def test_offer_scorer_starts_as_a_quantile_rule(
+    model: ResponseModel, start: str | None, pool: QueryPool
+) -> None:
     env = make(FeedEnv, pool, model, batch=50, skip="free")
-    rule = QuantileAsk(env, information_gain, alignment_gain)
-    data = env.rollout(12, rule, break_when_any_done=False)
+    data = env.rollout(12, QuantileAsk(env, *RULES[start]), break_when_any_done=False)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        learned = scorer_policy(env).strategy(data.clone().reshape(-1))["action"]
+        learned = scorer_policy(env, start).strategy(data.clone().reshape(-1))["action"]
     # With answers that never err, many queries split the samples alike; rounding orders them.
     assert (learned == data["action"].reshape(-1)).float().mean() > 0.99
     assert 0.05 < data["action"].float().mean() < 0.95

@@ -6,6 +6,7 @@ have, and random numbers go on from where they would have begun.
 
 from __future__ import annotations
 
+import gc
 import io
 
 import hydra  # noqa: F401
@@ -51,3 +52,5 @@ def warm_up() -> None:
 
 with torch.random.fork_rng(devices=[]):
     warm_up()
+gc.collect()
+gc.freeze()  # forks need not look through it, nor copy it

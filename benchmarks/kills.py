@@ -38,7 +38,9 @@ from typing import Any
 import torch
 from tabulate import tabulate
 
-import train  # noqa: F401  (forked processes need not import it)
+import torchrl_pref.evaluation.reports  # forked processes need not import these
+import torchrl_pref.training.start  # noqa: F401
+import train  # noqa: F401
 from torchrl_pref.checkpoints.checkpoint import Checkpoint
 from torchrl_pref.training.progress import Progress
 
@@ -320,9 +322,12 @@ def main() -> None:
         kinds += ["SIGKILL", "write", "SIGTERM", "SIGKILL", "SIGKILL"]
         for kind in itertools.islice(itertools.cycle(kinds), typed.kills):
             trials.kill(kind)
-        by_seed = [content(trials.undisturbed(f"seed={seed}")) for seed in (0, 1)]
+        by_seed: list[dict[str, Any]] = []
         for number in range(typed.starts):
             if number % 3 == 2:
+                if not by_seed:
+                    seeds = [f"seed={seed}" for seed in (0, 1)]
+                    by_seed += [content(trials.undisturbed(seed)) for seed in seeds]
                 trials.start_by_default(by_seed)
             else:
                 trials.start_twice(resume=number % 3 == 1)

@@ -63,7 +63,7 @@ def posterior(
     """Moments of the posterior after answers with gaps (H K-1 D), the prior being uniform."""
     rng = np.random.default_rng(seed)
     if tau is None and gaps.shape[2] > 6:
-        return _walk(gaps, rng, chains=1000, steps=9000)
+        return _walk(gaps, rng, chains=1000, steps=9 * draws // 400)
     proposal = _adapt(gaps, tau, tolerance, rng)
     parts = [proposal.draw(50_000, rng) for _ in range(max(1, draws // 50_000))]
     logs = np.concatenate(
@@ -103,10 +103,10 @@ class _Component(NamedTuple):
         n, v = len(self.place), self.freedom
         ahead = omega @ self.centre
         plane = omega @ self.basis / np.where(ahead > 0, ahead, 1.0)[:, None]
-        white = np.linalg.solve(self.factor, (plane - self.place).T)
+        white = (plane - self.place) @ np.linalg.inv(self.factor).T
         log = math.lgamma((v + n) / 2) - math.lgamma(v / 2) - n / 2 * math.log(v * math.pi)
         log -= np.log(np.diag(self.factor)).sum()
-        log = log - (v + n) / 2 * np.log1p(np.square(white).sum(0) / v)
+        log = log - (v + n) / 2 * np.log1p(np.einsum("np,np->n", white, white) / v)
         # What a piece of the plane is on the sphere, whose whole area counts as one.
         area = math.log(2) + (n + 1) / 2 * math.log(math.pi) - math.lgamma((n + 1) / 2)
         log = log + area - (n + 1) * np.log(np.where(ahead > 0, ahead, 1.0))

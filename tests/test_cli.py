@@ -7,6 +7,7 @@ import json
 import os
 import re
 import runpy
+import shutil
 import signal
 import subprocess
 import sys
@@ -31,13 +32,17 @@ ROOT = Path(__file__).parent.parent
 
 TINY_TASK = ["belief.samples=10", "belief.moves=1", "pool.size=40", "setup.budget=4"]
 TINY_TASK += ["evaluation.humans=6", "evaluation.metrics=[]"]
-TINY = [*TINY_TASK, "training.updates=3", "training.sessions=4", "training.steps=8"]
+FEW = ["training.sessions=4", "training.steps=8"]
+TINY = [*TINY_TASK, *FEW, "training.updates=3"]
+
+SHORT = [*TINY_TASK, *FEW, "training.updates=1", "evaluation.during=0"]
+"""For tests that are not about the training itself."""
 
 
-def start(script: str, *arguments: str, cwd: Path = ROOT) -> subprocess.Popen[str]:
+def start(script: str, *arguments: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [sys.executable, str(ROOT / script), *arguments],
-        cwd=cwd,
+        cwd=ROOT,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -131,7 +136,7 @@ def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path: Path) -> None:
 
 def test_sweep_makes_one_table(tmp_path: Path) -> None:
     sweep = f"hydra.sweep.dir={tmp_path}/sweep"
-    output = run("train.py", "-m", "setup=query,feed", "tau=optimal,0.5", *TINY, sweep)
+    output = run("train.py", "-m", "setup=query,feed", "tau=optimal,0.5", *SHORT, sweep)
     with (tmp_path / "sweep" / "summary.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [(row["setup"], row["tau"]) for row in rows] == [
@@ -146,7 +151,7 @@ def test_sweep_makes_one_table(tmp_path: Path) -> None:
     run("train.py", f"resume={tmp_path}/sweep/0")
     assert (tmp_path / "sweep" / "summary.csv").read_text() == before
     other = f"hydra.run.dir={tmp_path}/other/0"
-    run("train.py", "setup=query", "tau=optimal", "seed=4", *TINY, other)
+    run("train.py", "setup=query", "tau=optimal", "seed=4", *SHORT, other)
     both = f"checkpoint=[{tmp_path}/sweep/0,{tmp_path}/other/0]"
     output = run("evaluate.py", both, f"hydra.run.dir={tmp_path}/both")
     assert "RL (sweep/0)" in output
@@ -423,26 +428,30 @@ def test_bad_input_gets_one_line_status_2_and_no_files(
 
 def test_a_run_is_never_overwritten(tmp_path: Path) -> None:
     (tmp_path / "train_pool.pt").write_text("somebody's")
-    process = start("train.py", *TINY, f"hydra.run.dir={tmp_path}")
-    _, errors = process.communicate(timeout=60)
-    assert process.returncode == 2
-    assert "holds a run already" in errors
+    done = run_script("train.py", *TINY, f"hydra.run.dir={tmp_path}")
+    assert done.returncode == 2
+    assert "holds a run already" in done.stderr
     assert os.listdir(tmp_path) == ["train_pool.pt"]
 
 
 def test_folders_that_the_user_made_are_kept(tmp_path: Path) -> None:
     (tmp_path / "mine" / "run").mkdir(parents=True)
-    process = start("train.py", "tau=0", f"hydra.run.dir={tmp_path}/mine/run")
-    process.communicate(timeout=60)
-    assert process.returncode == 2
-    process = start("train.py", "tau=0", cwd=tmp_path / "mine" / "run")
-    process.communicate(timeout=60)
-    assert process.returncode == 2
+    mine = tmp_path / "mine" / "run"
+    assert run_script("train.py", "tau=0", f"hydra.run.dir={mine}").returncode == 2
+    assert run_script("train.py", "tau=0", folder=mine).returncode == 2
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["mine", "run"]
 
 
-def test_settings_that_a_checkpoint_brings_cannot_be_typed(tmp_path: Path) -> None:
-    run("train.py", *TINY, f"hydra.run.dir={tmp_path}")
+@pytest.fixture(scope="module")
+def a_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run, which is to be left as it is."""
+    folder = tmp_path_factory.mktemp("run")
+    run("train.py", *SHORT, f"hydra.run.dir={folder}")
+    return folder
+
+
+def test_settings_that_a_checkpoint_brings_cannot_be_typed(a_run: Path, tmp_path: Path) -> None:
+    shutil.copytree(a_run, tmp_path, dirs_exist_ok=True)
     for script, typed in (("evaluate.py", "checkpoint"), ("train.py", "resume")):
         done = run_script(script, f"{typed}={tmp_path}", "belief.samples=50")
         assert done.returncode == 2
@@ -467,7 +476,6 @@ def test_whoever_weighs_steps_is_not_asked_about_an_own_pool(tmp_path: Path) -> 
     assert not list((tmp_path / "tables").rglob("*"))
 
 
-def test_summary_is_plain_json(tmp_path: Path) -> None:
-    run("train.py", *TINY, f"hydra.run.dir={tmp_path}")
-    content = json.loads((tmp_path / "summary.json").read_text())
-    assert set(TINY) <= set(content["overrides"])
+def test_summary_is_plain_json(a_run: Path) -> None:
+    content = json.loads((a_run / "summary.json").read_text())
+    assert set(SHORT) <= set(content["overrides"])

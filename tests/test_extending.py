@@ -1,7 +1,11 @@
 """Each file of examples/extending is short, and the main job runs with it from outside."""
 
+import shutil
 import subprocess
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 from scripts import run_script
@@ -11,7 +15,8 @@ FOLDER = ROOT / "examples" / "extending"
 
 SMALL = [
     *("pool.size=40", "setup.budget=3", "evaluation.humans=6"),
-    *("training.updates=2", "training.sessions=6", "training.warm_up=1", "evaluation.during=0"),
+    *("training.updates=2", "training.sessions=6", "training.steps=8", "training.warm_up=1"),
+    "evaluation.during=0",
 ]
 
 JOBS = {
@@ -21,6 +26,13 @@ JOBS = {
     "human": ["human=my_human:Tiring", "human.patience=5"],
     "policy": ["setup=query", "policy=my_policy:perceptron", "policy.width=8"],
 }
+
+
+class Made(NamedTuple):
+    """A run of the main job."""
+
+    done: subprocess.CompletedProcess[str]
+    folder: Path
 
 
 def run(script: str, *arguments: str, folder: Path = FOLDER) -> subprocess.CompletedProcess[str]:
@@ -34,11 +46,24 @@ def test_each_is_one_short_file(path: Path) -> None:
     assert path.stem in (ROOT / "docs" / "extending.md").read_text()
 
 
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Made]:
+    """The main job with what a file has, run once; its folder is to be left as it is."""
+
+    @cache
+    def run_with(what: str) -> Made:
+        folder = tmp_path_factory.mktemp("made") / "run"
+        done = run("train.py", *SMALL, *JOBS[what], f"hydra.run.dir={folder}")
+        return Made(done, folder)
+
+    return run_with
+
+
 @pytest.mark.parametrize("what", JOBS)
-def test_the_main_job_runs_with_it(what: str, tmp_path: Path) -> None:
-    done = run("train.py", *SMALL, *JOBS[what], f"hydra.run.dir={tmp_path / 'run'}")
+def test_the_main_job_runs_with_it(what: str, made: Callable[[str], Made]) -> None:
+    done, folder = made(what)
     assert done.returncode == 0, done.stderr
-    assert (tmp_path / "run" / "checkpoint.pt").exists()
+    assert (folder / "checkpoint.pt").exists()
     assert "written to" in done.stdout
 
 
@@ -52,10 +77,12 @@ def test_strategies_are_rows_of_the_table(tmp_path: Path) -> None:
         assert name in (tmp_path / "run" / "tables.txt").read_text()
 
 
-def test_a_checkpoint_never_names_code_to_import(tmp_path: Path) -> None:
+def test_a_checkpoint_never_names_code_to_import(
+    made: Callable[[str], Made], tmp_path: Path
+) -> None:
     """What the run was made with is typed again, or is not imported."""
     folder = tmp_path / "run"
-    assert run("train.py", *SMALL, *JOBS["policy"], f"hydra.run.dir={folder}").returncode == 0
+    shutil.copytree(made("policy").folder, folder)
     longer = [f"resume={folder}", "training.updates=3"]
     untyped = run("train.py", *longer)
     assert untyped.returncode == 2

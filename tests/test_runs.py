@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from hydra import compose, initialize_config_dir
 from scripts import run_script
-from test_cli import ROOT, TINY, run, start
+from test_cli import ROOT, SHORT, run
 
 import app
 from torchrl_pref import sweeps
@@ -141,7 +141,7 @@ def test_evaluate_does_not_overwrite_a_run(tmp_path: Path) -> None:
 
 
 def test_a_reader_that_goes_away_costs_nothing(tmp_path: Path) -> None:
-    words = " ".join([*TINY, f"hydra.run.dir={tmp_path}"])
+    words = " ".join([*SHORT, f"hydra.run.dir={tmp_path}"])
     line = f"set -o pipefail; {sys.executable} train.py {words} 2>&1 | head -1"
     done = subprocess.run(["bash", "-c", line], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0
@@ -152,7 +152,7 @@ def test_a_reader_that_goes_away_costs_nothing(tmp_path: Path) -> None:
 
 def test_a_sweep_names_what_failed_and_then_runs_what_is_missing(tmp_path: Path) -> None:
     sweep = tmp_path / "a sweep"
-    typed = ["train.py", "-m", "setup=query", f"hydra.sweep.dir={json.dumps(str(sweep))}", *TINY]
+    typed = ["train.py", "-m", "setup=query", f"hydra.sweep.dir={json.dumps(str(sweep))}", *SHORT]
     failed = run_script(*typed, "tau=optimal,-1,0.5")
     assert failed.returncode == 2
     assert re.search(r"^ +1 .* tau=-1: expected a finite number above 0", failed.stdout, re.M)
@@ -202,10 +202,10 @@ def test_a_job_that_fails_is_a_row_of_the_table(tmp_path: Path) -> None:
 
 def test_sweeps_of_other_settings_do_not_mix(tmp_path: Path) -> None:
     folder = tmp_path / "0"
-    run("train.py", "setup=query", *TINY, f"hydra.run.dir={folder}")
+    run("train.py", "setup=query", *SHORT, f"hydra.run.dir={folder}")
     before = (folder / "summary.json").read_text()
     done = run_script(
-        "train.py", "-m", "setup=query", "tau=2,3", "seed=1", *TINY, f"hydra.sweep.dir={tmp_path}"
+        "train.py", "-m", "setup=query", "tau=2,3", "seed=1", *SHORT, f"hydra.sweep.dir={tmp_path}"
     )
     assert done.returncode == 2
     assert "seed=0 there and 1 here, tau=noisy there and 2 here" in done.stderr
@@ -216,15 +216,14 @@ def test_sweeps_of_other_settings_do_not_mix(tmp_path: Path) -> None:
 @pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
 def test_jobs_run_under_a_launcher(launcher: str, tmp_path: Path) -> None:
     chosen = [f"hydra/launcher={launcher}", f"hydra.sweep.dir={tmp_path}"]
-    process = start("train.py", "-m", "setup=query", "tau=-1,2", *TINY, *chosen)
-    output, errors = process.communicate(timeout=120)
-    assert process.returncode == 2
-    assert "job 0: failed" in errors.splitlines()[-1]
-    assert "tau=-1: expected" in output
+    done = run_script("train.py", "-m", "setup=query", "tau=-1,2", *SHORT, *chosen)
+    assert done.returncode == 2
+    assert "job 0: failed" in done.stderr.splitlines()[-1]
+    assert "tau=-1: expected" in done.stdout
     assert (tmp_path / "1" / "summary.json").exists()
     before = (tmp_path / "1" / "tables.txt").stat().st_mtime_ns
     # What is missing, by whatever launcher.
-    done = run_script("train.py", "-m", "setup=query", "tau=1,2", *TINY, chosen[1])
+    done = run_script("train.py", "-m", "setup=query", "tau=1,2", *SHORT, chosen[1])
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "1" / "tables.txt").stat().st_mtime_ns == before
     assert [row.get("failed") for row in sweeps.write_table(tmp_path)] == [None, None]

@@ -74,7 +74,7 @@ def test_moments_agree_with_quadrature(
     omega = uniform_sphere((n_features,), generator)
     answers = model(queries @ omega).exp().multinomial(1, generator=generator).squeeze(-1)
     mean, covariance = exact_moments(model, queries, answers)
-    sessions = 400
+    sessions = 400 if model in RESPONSE_MODELS else 150  # in tensors, which are slow
     samples, _ = converse(Belief(model), queries, answers, sessions, generator)
 
     per_session = samples.double().mean(1)
@@ -106,7 +106,7 @@ def test_effective_sample_size_is_what_it_says(
     assert ((ess >= 1) & (ess <= 100)).all()
 
 
-@pytest.mark.parametrize(("n_features", "n_options"), [(4, 2), (5, 3), (10, 3)])
+@pytest.mark.parametrize(("n_features", "n_options"), [(4, 2), (10, 3)])
 @pytest.mark.parametrize("model", RESPONSE_MODELS, ids=str)
 def test_calibration(
     model: ResponseModel, n_features: int, n_options: int, generator: Generator
@@ -156,7 +156,8 @@ CASES = [
 def test_samples_agree_with_importance_sampling(case: Case) -> None:
     """Over features, options, noise and odd histories; the benchmark has all of them."""
     gaps = history(case)
-    exact = posterior(gaps.double().numpy(), case.tau)
+    draws = 100_000 if case.features > 6 else 400_000  # each costs more, and says more
+    exact = posterior(gaps.double().numpy(), case.tau, draws)
     found = compare(case, gaps, exact, 500 if case.kind == "greedy" else 200)
     assert exact.draws > 5000
     assert found.bias < 0.01 + 3 * found.bias_error
@@ -166,7 +167,7 @@ def test_samples_agree_with_importance_sampling(case: Case) -> None:
 
 def test_one_question_answered_both_ways_without_error_is_left_out(generator: Generator) -> None:
     """It could hold on a plane of ties alone."""
-    belief, sessions = Belief(Optimal()), 200
+    belief, sessions = Belief(Optimal()), 50
     queries = torch.randn(sessions, 3, 5, generator=generator)
     samples, ess = belief.prior(sessions, 5, generator), torch.full((sessions,), 100.0)
     gaps = torch.zeros(sessions, 0, 2, 5)

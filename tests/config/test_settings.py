@@ -6,6 +6,7 @@ import copy
 import random
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, get_origin, get_type_hints, is_typeddict
@@ -36,10 +37,15 @@ ROOT = Path(__file__).parents[2]
 
 
 def composed(script: str, *overrides: str) -> dict[str, Any]:
+    return {str(key): copy.deepcopy(value) for key, value in _composed(script, *overrides).items()}
+
+
+@cache
+def _composed(script: str, *overrides: str) -> dict[Any, Any]:
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
         plain = OmegaConf.to_container(compose(script, list(overrides)))
     assert isinstance(plain, dict)
-    return {str(key): value for key, value in plain.items()}
+    return plain
 
 
 def test_a_random_sample_of_bad_settings_is_refused_in_one_line() -> None:
@@ -196,7 +202,7 @@ def test_a_batch_of_questions_with_many_answers_is_counted() -> None:
     "key", ["tau", "seed", "training.gamma", "logger", "setup", "policy", "algorithm", "belief"]
 )
 def test_a_missing_key_is_named(key: str) -> None:
-    typed = copy.deepcopy(composed("train"))
+    typed = composed("train")
     *sections, name = key.split(".")
     inner = typed[sections[0]] if sections else typed
     del inner[name]

@@ -12,9 +12,10 @@ import pytest
 import torch
 from conftest import RESPONSE_MODELS
 from helpers import ENVS, coin, make
+from scripts import CONTEXT
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
-from torchrl.collectors import Collector, MultiSyncCollector
+from torchrl.collectors import Collector, MultiSyncCollector, _multi_base
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import (
     CatTensors,
@@ -297,7 +298,12 @@ def test_workers_of_a_collector_never_face_the_same_humans() -> None:
     assert len(met.unique(dim=0)) == len(met)
 
 
-def test_an_environment_that_is_handed_to_workers_is_another_one_in_each() -> None:
+def test_an_environment_that_is_handed_to_workers_is_another_one_in_each(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It is pickled for workers that are forked from the server of the scripts, as for others."""
+    monkeypatch.setattr(_multi_base, "_get_mp_ctx", lambda: CONTEXT)
+    monkeypatch.setattr(_multi_base, "_set_mp_start_method_if_unset", lambda method: method)
     env = _feed()
     collector = MultiSyncCollector(
         [functools.partial(_same, env), functools.partial(_same, env)], None, **COLLECTED

@@ -103,7 +103,7 @@ def test_who_would_not_say_was_asked_and_teaches_nothing(
     kind: type, name: str, generator: Generator
 ) -> None:
     env = env_of(kind, name, generator, Silent, objective="information_gain")
-    data = env.rollout(80, break_when_any_done=False)["next"]
+    data = env.rollout(40, break_when_any_done=False)["next"]
     before, after = data["session"][:, :-1], data["session"][:, 1:]
     n_asked = after["n_asked"].squeeze(-1)
     asked = n_asked == before["n_asked"].squeeze(-1) + 1
@@ -148,8 +148,10 @@ def test_training_and_evaluation(setup: str, name: str, tmp_path: Path) -> None:
     trainer.run(tmp_path, lambda: None, logger=[])
     learned = {policy_key(settings): make_checkpoint(settings, task, trainer)}
     records = evaluate_task(settings, task, learned)
-    write_report(tmp_path, records)
-    assert list(tmp_path.glob("*.png"))
+    assert records.entries
+    if setup == "query":  # a report is drawn from the records alone, slowly
+        write_report(tmp_path, records)
+        assert list(tmp_path.glob("*.png"))
 
 
 @pytest.mark.parametrize("name", ["ranking", "best_worst", "approve"])

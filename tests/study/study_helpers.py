@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import deepcopy
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +28,16 @@ SMALL = ("pool.size=60", "setup.budget=6", "strategy=alignment_gain")
 
 def settings_of(*typed: str) -> dict[str, Any]:
     """The settings of ``python ask.py <typed>``."""
+    settings = deepcopy(_composed(*typed))
+    return check_ask_settings({str(key): value for key, value in settings.items()})
+
+
+@cache
+def _composed(*typed: str) -> dict[Any, Any]:
     with initialize_config_dir(str(CONF), version_base="1.3"):
         settings = OmegaConf.to_container(compose("ask", overrides=[*SMALL, *typed]))
     assert isinstance(settings, dict)
-    return check_ask_settings({str(key): value for key, value in settings.items()})
+    return settings
 
 
 def materials_of(*typed: str) -> Materials:

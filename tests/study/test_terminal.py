@@ -7,7 +7,6 @@ import os
 import pty
 import re
 import signal
-import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from itertools import chain
@@ -19,8 +18,8 @@ from typing import Any
 import pytest
 import torch
 from PIL import Image
-from scripts import TIMEOUT
-from study_helpers import CONF, SMALL, answer_all, careful, materials_of, study_of
+from scripts import TIMEOUT, start_in_terminal
+from study_helpers import SMALL, answer_all, careful, materials_of, study_of
 
 from torchrl_pref.errors import InputError
 from torchrl_pref.study.log import Log, LogError
@@ -32,6 +31,8 @@ from torchrl_pref.study.terminal import conversation, converse, player
 from torchrl_pref.study.terminal.files import QuestionFiles
 from torchrl_pref.study.terminal.lines import COMMANDS, Typed, hint, keys_of, understood
 from torchrl_pref.study.terminal.options import Room
+from torchrl_pref.tasks import drawing
+from torchrl_pref.tasks.drawing import save_animation
 from torchrl_pref.tasks.scene import Disc, Scene
 
 OMEGA = torch.tensor([0.5, -0.5, 0.5, 0.5])
@@ -59,10 +60,11 @@ Types = Callable[..., Typing]
 
 @pytest.fixture
 def types(monkeypatch: pytest.MonkeyPatch) -> Types:
-    """What sets the lines that are typed. Nothing sleeps meanwhile."""
+    """What sets the lines that are typed. Nothing sleeps meanwhile, and animations are empty."""
     monkeypatch.setenv("COLUMNS", "100")
     monkeypatch.setenv("LINES", "50")
     monkeypatch.setattr(Study, "think_ahead", lambda study: None)
+    monkeypatch.setattr(drawing, "save_animation", lambda scene, path: path.touch())
 
     def given(*lines: str | BaseException, then: Iterable[str] = ()) -> Typing:
         typing = Typing(chain(lines, then))
@@ -520,8 +522,12 @@ def test_that_asking_on_is_hardly_worth_it_is_said_once(
 
 
 def test_the_question_is_there_as_pictures(
-    tmp_path: Path, types: Types, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
+    types: Types,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(drawing, "save_animation", save_animation)
     study = study_of(tmp_path)
     types("a")
     converse(study, "P1")
@@ -681,18 +687,15 @@ class Talk:
 
     def __init__(self, folder: Path, *arguments: str) -> None:
         self._own, its = pty.openpty()
-        command = [sys.executable, str(CONF.parent / "ask.py"), "ui=terminal", *arguments]
-        environment = {**os.environ, "TERM": "xterm", "COLUMNS": "100", "LINES": "50"}
-        self.process = subprocess.Popen(
-            command,
-            stdin=its,
-            stdout=its,
-            stderr=its,
-            cwd=folder,
-            env=environment,
-            start_new_session=True,
+        self.process = start_in_terminal(
+            "ask.py",
+            "ui=terminal",
+            *arguments,
+            folder=folder,
+            terminal=os.ttyname(its),
+            **{"TERM": "xterm", "COLUMNS": "100", "LINES": "50"},
         )
-        os.close(its)
+        self._its: int | None = its  # until the program has it open as well
         self._left = b""  # printed, and not looked at yet
 
     def until(self, text: str) -> str:
@@ -700,6 +703,7 @@ class Talk:
         while text.encode() not in self._left:
             assert select([self._own], [], [], TIMEOUT)[0], self._left.decode(errors="replace")
             self._left += os.read(self._own, 65536)  # fails where the program has ended
+            self._let_go()
         before, found, self._left = self._left.partition(text.encode())
         return (before + found).decode(errors="replace")
 
@@ -710,15 +714,26 @@ class Talk:
     def signal(self, number: int) -> None:
         """Send a signal, and type Enter: one that comes just before the program waits for a line is
         noticed after the line."""
-        self.process.send_signal(number)
+        assert self.process.pid is not None
+        os.kill(self.process.pid, number)
         self.type("\n")
 
     def end(self) -> None:
         """Kill it, where it has not ended."""
-        if self.process.poll() is None:
-            self.process.kill()
-        self.process.wait()
+        self.process.kill()
+        self.process.join()
+        self._let_go()
         os.close(self._own)
+
+    def _let_go(self) -> None:
+        if self._its is not None:
+            os.close(self._its)
+            self._its = None
+
+    def status(self) -> int | None:
+        """With which it ends."""
+        self.process.join(TIMEOUT)
+        return self.process.exitcode
 
 
 def test_the_script_in_a_terminal(tmp_path: Path, run_in_terminal: Callable[..., Talk]) -> None:
@@ -734,7 +749,7 @@ def test_the_script_in_a_terminal(tmp_path: Path, run_in_terminal: Callable[...,
     last = talk.until("export: ")
     assert "1 answer of 1 person" in last
     assert "Traceback" not in last
-    assert talk.process.wait() == 0
+    assert talk.status() == 0
     again = run_in_terminal(f"resume={folder}")
     assert "Question 2 of at most 6" in again.until("h help")
     again.type("b\n")
@@ -742,7 +757,7 @@ def test_the_script_in_a_terminal(tmp_path: Path, run_in_terminal: Callable[...,
     again.until("> ")
     again.signal(signal.SIGTERM)
     assert "2 answers of 1 person" in again.until("stopped")
-    assert again.process.wait() == 128 + signal.SIGTERM
+    assert again.status() == 128 + signal.SIGTERM
 
 
 def test_a_terminal_without_letters_to_draw_with_is_refused(

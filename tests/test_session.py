@@ -316,7 +316,7 @@ def test_a_feed_shows_what_the_environment_would(strategy: str) -> None:
         pool, SimulatedHuman(MODEL), Belief(MODEL), 6, 25, skip="free", batch_size=(1,), seed=3
     )
     if strategy == "policy":
-        module = pretrained_policy(env, "noisy").strategy
+        module = pretrained_policy(env).strategy
     else:
         module = FEED_STRATEGIES[strategy](env)
     keys = torch.rand(1, 300, generator=Generator().manual_seed(3))

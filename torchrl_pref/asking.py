@@ -86,8 +86,7 @@ def strategy_of(strategy: str | MakeStrategy, env: EnvBase) -> TensorDictModuleB
     if strategy == "policy":
         from torchrl_pref.pretrained import pretrained_policy  # and all that it takes
 
-        kind = "noisy" if env.belief.response_model.is_soft else "optimal"
-        return pretrained_policy(env, kind).strategy
+        return pretrained_policy(env).strategy
     if isinstance(strategy, str):
         return make_strategy(strategy, env, "policy")
     if not callable(strategy) or isinstance(strategy, TensorDictModuleBase):

@@ -162,7 +162,7 @@ def test_evaluation_and_policies_are_the_same_on_a_transformed_environment(
 ) -> None:
     model = RESPONSE_MODELS[0]
     makers: list[Any] = [
-        lambda env: pretrained_policy(env, "noisy").strategy,
+        lambda env: pretrained_policy(env).strategy,
         lambda env: paper_policy(env).strategy,
         lambda env: attention_policy(env).strategy,
         lambda env: QuantileAsk(env) if is_feed(env) else Greedy(model),

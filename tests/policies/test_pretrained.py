@@ -14,21 +14,24 @@ from torchrl_pref.questions.responses import Boltzmann, Optimal
 
 
 @pytest.mark.parametrize("setup", ["query", "feed"])
-@pytest.mark.parametrize("tau", ["noisy", "optimal"])
-def test_policies_are_small_and_what_they_say(setup: str, tau: str) -> None:
+@pytest.mark.parametrize("tau", [None, "noisy", "optimal"])
+def test_policies_are_small_and_what_they_say(setup: str, tau: str | None) -> None:
     for seed in range(SEEDS):
         checkpoint = pretrained_checkpoint(setup, tau, seed)
         settings = checkpoint.settings
-        assert (settings["setup"]["name"], settings["tau"], settings["seed"]) == (setup, tau, seed)
+        assert (settings["setup"]["name"], settings["seed"]) == (setup, seed)
+        assert checkpoint.of_every_task == (tau is None)
+        assert tau is None or settings["tau"] == tau
         assert settings["objective"] == "alignment"
-        assert (FOLDER / f"{setup}-{tau}-{seed}.pt").stat().st_size < 60_000
+        assert (FOLDER / f"{setup}-{tau or 'every'}-{seed}.pt").stat().st_size < 60_000
 
 
 @pytest.mark.parametrize("kind", [QueryEnv, FeedEnv])
 @pytest.mark.parametrize("shape", [(50, 2, 4), (30, 3, 6)])
 def test_they_work_on_any_pool(kind: type, shape: tuple[int, ...], generator: Generator) -> None:
     pool = QueryPool(torch.randn(shape, generator=generator))
-    for tau, model in (("noisy", Boltzmann(3.0)), ("optimal", Optimal())):
+    models = ("noisy", Boltzmann(3.0)), ("optimal", Optimal()), (None, Boltzmann(3.0))
+    for tau, model in models:
         options = {"skip": "free"} if kind is FeedEnv else {}
         env = kind(
             pool,

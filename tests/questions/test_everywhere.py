@@ -79,7 +79,7 @@ def test_policies(kind: type, name: str, generator: Generator) -> None:
     env = env_of(kind, name, generator)
     for policy in [
         *(each.make(env) for each in POLICIES.values()),
-        pretrained_policy(env, "noisy"),
+        pretrained_policy(env),
     ]:
         data = env.rollout(env.max_steps, policy.strategy, break_when_any_done=False)
         assert data["logits"].isfinite().all()

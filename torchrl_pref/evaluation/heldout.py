@@ -22,6 +22,7 @@ from torchrl_pref.config.sections import Plain, Settings, flat
 from torchrl_pref.errors import InputError
 from torchrl_pref.evaluation.comparison import policy_key
 from torchrl_pref.evaluation.heldout_pool import (
+    CLOSELY,
     THRESHOLDS,
     Cell,
     Job,
@@ -66,7 +67,8 @@ def run_protocol(
     torch.multiprocessing.set_sharing_strategy("file_system")
     context = get_context("spawn")
     with ProcessPoolExecutor(workers, context, _start_worker, (allowed(),)) as executor:
-        feeds = {job.cell: job for job in jobs if job.cell.setup == "feed" and job.pool == 0}
+        closely = [job for job in jobs if job.cell.features in CLOSELY and job.pool == 0]
+        feeds = {job.cell: job for job in closely if job.cell.setup == "feed"}
         fits = [replace(job, learned={}, own=(), thresholds=THRESHOLDS) for job in feeds.values()]
         alignments = executor.map(fit_threshold, fits)
         best = {

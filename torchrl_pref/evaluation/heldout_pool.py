@@ -59,6 +59,11 @@ RUNS = 3
 """Of each strong baseline, on the same humans: one run tells its alignment to no better than .005.
 Where the features are balanced there is one run: nobody is held to .005 there."""
 
+RUNS_ON_OTHER_TASKS = 2
+
+CLOSELY = ("corners", "own")
+"""Features on which all that is known is tried, and not the rules alone that matter."""
+
 REPEATED = (
     "greedy_information",
     "greedy_alignment",
@@ -98,7 +103,7 @@ class Job:
         settings: the sections ``task``, ``pool``, ``belief``, ``setup`` and ``device``.
         cell, pool: which; ``pool`` is a number.
         learned: the policies of each kind by key, one for each training seed.
-        thresholds: in bits, of the feed's threshold rules.
+        thresholds: in bits, of the feed's threshold rules, where these are tried.
         own: strategies of the user, as typed.
     """
 
@@ -136,7 +141,7 @@ def run_pool(job: Job) -> list[Entry]:
     torch.manual_seed(seed)  # of policies that draw their actions
     exam = make_exam(job.settings, task, pool)
     results = run_side_by_side(make_env, humans, lineup, exam)
-    if job.cell.setup == "query" and job.cell.features == "corners":
+    if job.cell.setup == "query" and job.cell.features in CLOSELY:
         greedy = Greedy(task.response_model)
         if len(pool) >= env.budget:
             setup = {**job.settings["setup"], "repeats": False}
@@ -207,7 +212,8 @@ def _judged(job: Job, env: QueryEnv | FeedEnv, seed: int, beside: Sequence[str])
 def _lineup(job: Job, task: Problem, env: QueryEnv | FeedEnv, seed: int) -> list[Entrant]:
     """The baselines, and the strong ones again."""
     lineup = [Entrant(*each) for each in _baselines(job, task, env, seed).items()]
-    for _ in range(1, RUNS if job.cell.features != "balanced" else 1):
+    runs = RUNS if job.cell.features in CLOSELY else RUNS_ON_OTHER_TASKS
+    for _ in range(1, 1 if job.cell.features == "balanced" else runs):
         again = _baselines(job, task, env, seed).items()
         lineup += [Entrant(*each) for each in again if kind_of(each[0]) in REPEATED]
     return lineup
@@ -219,13 +225,15 @@ def _baselines(
     """The strategies that are not learned, by key."""
     model = task.response_model
     if is_feed(env):
-        return {
+        rules: dict[str, TensorDictModuleBase] = {
             "ask_all": RandomAsk(),
-            f"threshold:{job.thresholds[0]:g}": ThresholdAsk(env, job.thresholds[0]),
             "quantile_information": QuantileAsk(env),
             "quantile_alignment": QuantileAsk(env, alignment_gain),
-            "quantile_both": QuantileAsk(env, information_gain, late=alignment_gain),
         }
+        for bits in job.thresholds:
+            rules[f"threshold:{bits:g}"] = ThresholdAsk(env, bits)
+            rules["quantile_both"] = QuantileAsk(env, information_gain, late=alignment_gain)
+        return rules
     strategies: dict[str, TensorDictModuleBase] = {
         "random": RandomQuery(seed + 1),
         "greedy_information": Greedy(model),
@@ -233,7 +241,7 @@ def _baselines(
     }
     if job.cell.features != "balanced":
         strategies["volume_removal"] = Greedy(model, volume_removal)
-    if job.cell.features == "corners" and env.n_answers**2 <= MOST_FOLLOWED:
+    if job.cell.features in CLOSELY and env.n_answers**2 <= MOST_FOLLOWED:
         strategies["lookahead"] = Lookahead(model)
     return strategies
 

@@ -39,10 +39,10 @@ SHORT = [*TINY_TASK, *FEW, "training.updates=1", "evaluation.during=0"]
 """For tests that are not about the training itself."""
 
 
-def start(script: str, *arguments: str) -> subprocess.Popen[str]:
+def start(script: str, *arguments: str, cwd: Path = ROOT) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [sys.executable, str(ROOT / script), *arguments],
-        cwd=ROOT,
+        cwd=cwd,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -433,17 +433,21 @@ def test_bad_input_gets_one_line_status_2_and_no_files(
 
 def test_a_run_is_never_overwritten(tmp_path: Path) -> None:
     (tmp_path / "train_pool.pt").write_text("somebody's")
-    done = run_script("train.py", *TINY, f"hydra.run.dir={tmp_path}")
-    assert done.returncode == 2
-    assert "holds a run already" in done.stderr
+    process = start("train.py", *TINY, f"hydra.run.dir={tmp_path}")
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert "holds a run already" in errors
     assert os.listdir(tmp_path) == ["train_pool.pt"]
 
 
 def test_folders_that_the_user_made_are_kept(tmp_path: Path) -> None:
     (tmp_path / "mine" / "run").mkdir(parents=True)
-    mine = tmp_path / "mine" / "run"
-    assert run_script("train.py", "tau=0", f"hydra.run.dir={mine}").returncode == 2
-    assert run_script("train.py", "tau=0", folder=mine).returncode == 2
+    process = start("train.py", "tau=0", f"hydra.run.dir={tmp_path}/mine/run")
+    process.communicate(timeout=60)
+    assert process.returncode == 2
+    process = start("train.py", "tau=0", cwd=tmp_path / "mine" / "run")
+    process.communicate(timeout=60)
+    assert process.returncode == 2
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["mine", "run"]
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from hydra import compose, initialize_config_dir
 from scripts import run_script
-from test_cli import ROOT, SHORT, run
+from test_cli import ROOT, SHORT, run, start
 
 import app
 from torchrl_pref import sweeps
@@ -216,10 +216,11 @@ def test_sweeps_of_other_settings_do_not_mix(tmp_path: Path) -> None:
 @pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
 def test_jobs_run_under_a_launcher(launcher: str, tmp_path: Path) -> None:
     chosen = [f"hydra/launcher={launcher}", f"hydra.sweep.dir={tmp_path}"]
-    done = run_script("train.py", "-m", "setup=query", "tau=-1,2", *SHORT, *chosen)
-    assert done.returncode == 2
-    assert "job 0: failed" in done.stderr.splitlines()[-1]
-    assert "tau=-1: expected" in done.stdout
+    process = start("train.py", "-m", "setup=query", "tau=-1,2", *SHORT, *chosen)
+    output, errors = process.communicate(timeout=120)
+    assert process.returncode == 2
+    assert "job 0: failed" in errors.splitlines()[-1]
+    assert "tau=-1: expected" in output
     assert (tmp_path / "1" / "summary.json").exists()
     before = (tmp_path / "1" / "tables.txt").stat().st_mtime_ns
     # What is missing, by whatever launcher.

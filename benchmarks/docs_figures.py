@@ -28,6 +28,7 @@ import shlex
 import shutil
 import subprocess
 from collections.abc import Callable, Iterator
+from itertools import product
 from typing import Any, NamedTuple
 
 from tabulate import tabulate
@@ -45,6 +46,7 @@ from torchrl_pref.evaluation.views import (
     mean_and_interval,
     milestones,
 )
+from torchrl_pref.pretrained import SEEDS
 
 DOCS = ROOT / "docs"
 
@@ -271,6 +273,12 @@ def every_row(cell: str, records: Records) -> dict[str, str]:
 
 TAUS = ("noisy", "optimal")
 HELDOUT = "python evaluate.py protocol=heldout"
+MADE_FOR_IT = ",".join(
+    f"torchrl_pref/policies/weights/{setup}-{tau}-{seed}.pt"
+    for setup, tau, seed in product(("query", "feed"), TAUS, range(SEEDS))
+)
+"""The policies that were trained on the Gridworld."""
+
 FAR = "task=gaussian task.dimension=24 task.skew=3000"
 """More features, and more alike, than any training saw."""
 
@@ -310,7 +318,7 @@ PARTS: dict[str, Part] = {
     ),
     "heldout": Part(
         "docs/results.md",
-        (f"python evaluate.py protocol=heldout hydra.run.dir={{folder}} -> {CSV}",),
+        (f"{HELDOUT} checkpoint=[{MADE_FOR_IT}] hydra.run.dir={{folder}} -> {CSV}",),
         13,
         heldout,
     ),

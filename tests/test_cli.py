@@ -189,7 +189,14 @@ def test_attention_experiment(tmp_path: Path) -> None:
 
 def test_evaluate_compares_the_baselines(tmp_path: Path) -> None:
     output = run("evaluate.py", *TINY_TASK, f"hydra.run.dir={tmp_path}")
-    for row in ("optimal human", "noisy human", "random", "information_gain", "cosine of mean", "repeated"):
+    for row in (
+        "optimal human",
+        "noisy human",
+        "random",
+        "information_gain",
+        "cosine of mean",
+        "repeated",
+    ):
         assert row in output
     with (tmp_path / "curves.csv").open() as file:
         rows = list(csv.DictReader(file))

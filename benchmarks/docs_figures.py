@@ -272,7 +272,7 @@ def every_row(cell: str, records: Records) -> dict[str, str]:
 
 
 TAUS = ("noisy", "optimal")
-HELDOUT = "python evaluate.py protocol=heldout"
+HELDOUT, SMALLER = "python evaluate.py protocol=heldout", "pool.size=300"
 MADE_FOR_IT = ",".join(
     f"torchrl_pref/policies/weights/{setup}-{tau}-{seed}.pt"
     for setup, tau, seed in product(("query", "feed"), TAUS, range(SEEDS))
@@ -348,10 +348,11 @@ PARTS: dict[str, Part] = {
     "tasks": Part(
         "docs/results.md",
         (
-            f"{HELDOUT} tasks=[driver,lds,gymnasium] hydra.run.dir={{folder}}/tasks -> tasks/{CSV}",
-            f"{HELDOUT} {FAR} hydra.run.dir={{folder}}/gaussian -> gaussian/{CSV}",
+            f"{HELDOUT} {SMALLER} tasks=[driver,lds,gymnasium] hydra.run.dir={{folder}}/tasks "
+            f"-> tasks/{CSV}",
+            f"{HELDOUT} {SMALLER} {FAR} hydra.run.dir={{folder}}/gaussian -> gaussian/{CSV}",
             "python examples/pendulum_file.py {folder}/pendulum.csv 2000 -> pendulum.csv",
-            f"{HELDOUT} task=files task.path={{folder}}/pendulum.csv "
+            f"{HELDOUT} {SMALLER} task=files task.path={{folder}}/pendulum.csv "
             f"hydra.run.dir={{folder}}/files -> files/{CSV}",
         ),
         40,

@@ -248,7 +248,7 @@ def tasks(folder: Path) -> dict[str, str]:
             rows.append(row)
         tables[f"tasks-{cell.replace('/', '-')}"] = table(rows)
     order = sorted(cells, key=lambda cell: (cell.split("/")[0] == "feed", cell.split("/")[2]))
-    return {**tables, "every-task": table([every_row(cell, cells[cell]) for cell in order])}
+    return {**tables, "tasks-every": table([every_row(cell, cells[cell]) for cell in order])}
 
 
 def every_row(cell: str, records: Records) -> dict[str, str]:

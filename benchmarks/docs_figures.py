@@ -279,8 +279,6 @@ MADE_FOR_IT = ",".join(
 )
 """The policies that were trained on the Gridworld."""
 
-FAR = "task=gaussian task.dimension=24 task.skew=3000"
-"""More features, and more alike, than any training saw."""
 
 TRAIN, EVALUATE = "python train.py setup=query tau=noisy", "evaluation.humans=300"
 
@@ -350,7 +348,6 @@ PARTS: dict[str, Part] = {
         (
             f"{HELDOUT} {SMALLER} tasks=[driver,lds,gymnasium] hydra.run.dir={{folder}}/tasks "
             f"-> tasks/{CSV}",
-            f"{HELDOUT} {SMALLER} {FAR} hydra.run.dir={{folder}}/gaussian -> gaussian/{CSV}",
             "python examples/pendulum_file.py {folder}/pendulum.csv 2000 -> pendulum.csv",
             f"{HELDOUT} {SMALLER} task=files task.path={{folder}}/pendulum.csv "
             f"hydra.run.dir={{folder}}/files -> files/{CSV}",

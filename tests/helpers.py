@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -11,7 +12,8 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from torchrl_pref.beliefs.sampled import Belief
-from torchrl_pref.build import make_pools, make_task
+from torchrl_pref.build import load_weights, make_pools, make_task
+from torchrl_pref.checkpoints.checkpoint import Checkpoint
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.humans.simulated import SimulatedHuman
@@ -20,7 +22,7 @@ from torchrl_pref.questions.base import Evidence
 from torchrl_pref.questions.choice import evidence_of_gaps
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.strategies import RandomAsk, RandomQuery
-from torchrl_pref.training.start import make_trainer
+from torchrl_pref.training.start import make_checkpoint, make_trainer
 from torchrl_pref.training.trainer import Trainer
 
 ENVS = [QueryEnv, FeedEnv]
@@ -108,6 +110,24 @@ def settings_of(setup: str = "feed", policy: str = "scorer", **training: Any) ->
 def trainer_of(settings: dict[str, Any]) -> tuple[Trainer, Any]:
     task = make_task(*make_pools(settings), settings["tau"], settings)
     return make_trainer(settings, task), task
+
+
+def trained_in_parts(settings: dict[str, Any], parts: list[int], folder: Path) -> Checkpoint:
+    """The checkpoint of a run that is stopped after each of these updates but the last, and resumed
+    by another trainer; its logs are in the folder."""
+    path = folder / "checkpoint.pt"
+    for updates in parts:
+        settings["training"]["updates"] = updates
+        trainer, task = trainer_of(settings)
+        if path.exists():
+            checkpoint = Checkpoint.load(path)
+            load_weights(trainer.policy, checkpoint)
+            torch.rand(7)  # whatever else used the global generator
+            trainer.load_state_dict(checkpoint.training)
+        trainer.run(
+            folder, lambda task=task, of=trainer: make_checkpoint(settings, task, of).save(path)
+        )
+    return Checkpoint.load(path)
 
 
 def same(first: Any, second: Any) -> bool:

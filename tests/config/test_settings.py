@@ -7,6 +7,7 @@ import random
 import subprocess
 import sys
 from functools import cache
+from inspect import signature
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, get_origin, get_type_hints, is_typeddict
@@ -25,11 +26,12 @@ from torchrl_pref.checkpoints import contents
 from torchrl_pref.config import checks, memory, sections, settings, together
 from torchrl_pref.envs import objectives
 from torchrl_pref.errors import InputError, one_line
-from torchrl_pref.policies import attention
+from torchrl_pref.policies import POLICIES, attention
 from torchrl_pref.questions import QUESTIONS
 from torchrl_pref.questions.prior_evidence import evidence_of, joined
 from torchrl_pref.questions.responses import Boltzmann
-from torchrl_pref.strategies import FEED_STRATEGIES, STRATEGIES
+from torchrl_pref.strategies import FEED_STRATEGIES, STRATEGIES, BatchOf
+from torchrl_pref.tasks import TASKS
 from torchrl_pref.training.algorithms import ALGORITHMS
 from torchrl_pref.training.loggers import LOGGERS
 
@@ -113,6 +115,10 @@ def test_words_are_those_of_the_library() -> None:
         settings.POLICIES["attention"]["policy.tokens"]("policy.tokens", tokens)
     assert set(settings.ALGORITHMS) == set(ALGORITHMS) == set(contents.ALGORITHMS)
     assert set(checks.LOGGERS) == {"csv", *LOGGERS}
+    bound = {name for name, kind in POLICIES.items() if "D" in kind.query + kind.feed}
+    assert set(together.OF_ONE_DIMENSION) == bound
+    assert set(settings.PROTOCOL_TASKS) <= set(TASKS)
+    assert signature(BatchOf).parameters["shortlist"].default == memory.SHORTLIST
 
 
 @pytest.mark.parametrize(

@@ -7,11 +7,10 @@ from typing import Any
 
 import pytest
 import torch
-from helpers import same, settings_of, trainer_of
+from helpers import same, settings_of, trained_in_parts, trainer_of
 from torch import Generator
 
-from torchrl_pref.build import load_policy, load_weights, make_pools, make_task, make_training_env
-from torchrl_pref.checkpoints.checkpoint import Checkpoint
+from torchrl_pref.build import load_policy, make_pools, make_task, make_training_env
 from torchrl_pref.config.settings import check_run
 from torchrl_pref.errors import InputError
 from torchrl_pref.training import drawn
@@ -74,23 +73,8 @@ def test_each_batch_is_of_another_problem_and_of_whole_sessions(setup: str) -> N
 def test_a_resumed_one_goes_on_with_the_problems_that_were_to_come(
     setup: str, tmp_path: Path
 ) -> None:
-    results = []
-    for stops in ([], [2]):
-        settings = settings_over_many(setup)
-        path = tmp_path / f"{len(stops)}.pt"
-        for updates in [*stops, 4]:
-            settings["training"]["updates"] = updates
-            trainer, task = trainer_of(settings)
-            if path.exists():
-                checkpoint = Checkpoint.load(path)
-                load_weights(trainer.policy, checkpoint)
-                trainer.load_state_dict(checkpoint.training)
-            trainer.run(
-                tmp_path / f"run{len(stops)}",
-                lambda s=settings, k=task, t=trainer, p=path: make_checkpoint(s, k, t).save(p),
-            )
-        results.append(Checkpoint.load(path))
-    whole, resumed = results
+    whole = trained_in_parts(settings_over_many(setup), [4], tmp_path / "whole")
+    resumed = trained_in_parts(settings_over_many(setup), [2, 4], tmp_path / "resumed")
     start = trainer_of(settings_over_many(setup))[0].policy.weights.state_dict()
     assert not same(whole.weights, start)  # something was learned
     for name in ("weights", "optimizer", "sessions", "env_generator", "global_generator"):

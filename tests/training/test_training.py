@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import torch
-from helpers import same, settings_of, trainer_of
+from helpers import same, settings_of, trained_in_parts, trainer_of
 from tensordict import TensorDict
 
 from torchrl_pref.build import load_weights, reload_task
@@ -34,20 +34,8 @@ def test_resumed_run_equals_an_uninterrupted_one_bit_for_bit(
         settings = {**settings_of(setup, policy), "algorithm": algorithm}
         if policy == "scorer":  # sessions that are left half-way keep what they were given
             settings["demonstrations"] = {"count": 2, "alternatives": 3, "tau": 2.0}
-        path = tmp_path / f"{len(stops)}.pt"
-        for updates in [*stops, 6]:
-            settings["training"]["updates"] = updates
-            trainer, task = trainer_of(settings)
-            if path.exists():
-                checkpoint = Checkpoint.load(path)
-                load_weights(trainer.policy, checkpoint)
-                torch.rand(7)  # whatever else used the global generator
-                trainer.load_state_dict(checkpoint.training)
-            trainer.run(
-                tmp_path / f"run{len(stops)}",
-                lambda s=settings, k=task, t=trainer, p=path: make_checkpoint(s, k, t).save(p),
-            )
-        results.append(Checkpoint.load(path))
+        folder = tmp_path / f"run{len(stops)}"
+        results.append(trained_in_parts(settings, [*stops, 6], folder))
     whole, resumed = results
     assert same(whole.weights, resumed.weights)
     for name in ("update", "optimizer", "sessions", "env_generator", "global_generator"):

@@ -96,7 +96,7 @@ def check(settings: Plain) -> Settings:
             "expected by train.py alone; remove it"
         )
     if settings.get("tasks") is not None:
-        refuse_one_task(settings)
+        check_tasks(settings)
     if settings.get("protocol") is not None:
         typed.refuse_other_overrides("protocol", PROTOCOL_KEYS)
     elif settings.get("checkpoint") is not None:
@@ -207,18 +207,16 @@ def run_heldout(settings: Settings) -> Records:
         checkpoints = [Checkpoint.load(path) for path in paths]
     learned: dict[Cell, list[Checkpoint]] = {}
     for checkpoint in checkpoints:
-        own = checkpoint.settings["tau"]
-        for tau in ("noisy", "optimal") if checkpoint.of_every_task else (own,):
-            learned.setdefault(Cell(checkpoint.settings["setup"]["name"], tau), []).append(
-                checkpoint
-            )
+        own = checkpoint.settings
+        for tau in ("noisy", "optimal") if checkpoint.of_every_task else (own["tau"],):
+            learned.setdefault(Cell(own["setup"]["name"], tau), []).append(checkpoint)
     return heldout.run_protocol(
         tasks_of(settings), learned, settings["workers"], list(own_strategies(settings))
     )
 
 
-def refuse_one_task(settings: Plain) -> None:
-    """Refuse several tasks where only one is looked at.
+def check_tasks(settings: Plain) -> None:
+    """Refuse ``tasks`` where one task is looked at, or another key chooses it.
 
     Raises:
         InputError: ``tasks`` was typed without the protocol, or beside a task or pools.

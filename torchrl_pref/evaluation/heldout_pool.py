@@ -55,11 +55,9 @@ looked at while the feed's policy was designed, and are no longer used."""
 FINE_SAMPLES, FINE_HUMANS = 4000, 5
 """Greedy with 40 times the samples is 40 times the work: it faces a few humans of each pool."""
 
-RUNS = 3
+RUNS, RUNS_ON_OTHER_TASKS, RUNS_IF_BALANCED = 3, 2, 1
 """Of each strong baseline, on the same humans: one run tells its alignment to no better than .005.
-Where the features are balanced there is one run: nobody is held to .005 there."""
-
-RUNS_ON_OTHER_TASKS = 2
+Where the features are balanced nobody is held to .005."""
 
 CLOSELY = ("corners", "own")
 """Features on which all that is known is tried, and not the rules alone that matter."""
@@ -212,11 +210,17 @@ def _judged(job: Job, env: QueryEnv | FeedEnv, seed: int, beside: Sequence[str])
 def _lineup(job: Job, task: Problem, env: QueryEnv | FeedEnv, seed: int) -> list[Entrant]:
     """The baselines, and the strong ones again."""
     lineup = [Entrant(*each) for each in _baselines(job, task, env, seed).items()]
-    runs = RUNS if job.cell.features in CLOSELY else RUNS_ON_OTHER_TASKS
-    for _ in range(1, 1 if job.cell.features == "balanced" else runs):
+    for _ in range(1, _runs(job.cell.features)):
         again = _baselines(job, task, env, seed).items()
         lineup += [Entrant(*each) for each in again if kind_of(each[0]) in REPEATED]
     return lineup
+
+
+def _runs(features: str) -> int:
+    """Of each strong baseline."""
+    if features == "balanced":
+        return RUNS_IF_BALANCED
+    return RUNS if features in CLOSELY else RUNS_ON_OTHER_TASKS
 
 
 def _baselines(
@@ -232,6 +236,7 @@ def _baselines(
         }
         for bits in job.thresholds:
             rules[f"threshold:{bits:g}"] = ThresholdAsk(env, bits)
+        if job.cell.features in CLOSELY:
             rules["quantile_both"] = QuantileAsk(env, information_gain, late=alignment_gain)
         return rules
     strategies: dict[str, TensorDictModuleBase] = {

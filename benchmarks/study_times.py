@@ -1,6 +1,6 @@
 """From an answer to the next question: the server's part, and what a person at the browser waits.
 
-The exit status is 1 where the median is more than 30 ms of the server, or 100 ms in all.
+The exit status is 1 where more than one of twenty takes over 30 ms of the server, or 100 ms in all.
 
 The server is ``ask.py`` itself. Of the server the time from a request over HTTP to the whole of its
 reply is taken; in Chromium the time from the key to the next question on the screen.
@@ -14,6 +14,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[0] = str(ROOT)  # and not this folder, whose select.py would hide Python's own
 
+import gc
 import random
 import statistics
 import tempfile
@@ -37,6 +38,9 @@ FIRST = 2
 
 BUDGET = 20
 
+PEOPLE = "P1", "P2", "P3"
+"""Who answer over HTTP, one after the other."""
+
 LUCK = random.Random(0)
 
 WAIT = """
@@ -53,13 +57,13 @@ dispatchEvent(new KeyboardEvent("keydown", { key }));
 """Press a key; the milliseconds until the next question was painted."""
 
 
-def over_http(server: Server, think: float) -> Iterator[float]:
+def over_http(server: Server, code: str, think: float) -> Iterator[float]:
     """Milliseconds of each answer of a person."""
-    _, state = server.post("/api/join", code="P1")
+    _, state = server.post("/api/join", code=code)
     while state["question"] is not None:
         time.sleep(think)
         said = LUCK.randrange(len(state["question"]["answers"]))
-        body = {"code": "P1", "key": state["question"]["key"], "answer": said, **WATCHED}
+        body = {"code": code, "key": state["question"]["key"], "answer": said, **WATCHED}
         begun = time.perf_counter()
         _, state = server.post("/api/answer", **body)
         yield 1000 * (time.perf_counter() - begun)
@@ -73,9 +77,9 @@ def in_browser(server: Server, browser: Browser, think: float) -> Iterator[float
         yield browser.driver.execute_async_script(WAIT, LUCK.choice("ab"))
 
 
-def row(label: str, where: str, size: int, took: list[float]) -> Row:
-    """What is told of some times in milliseconds."""
-    took = took[FIRST:]
+def row(label: str, where: str, size: int, people: list[Iterator[float]]) -> Row:
+    """What is told of each person's times in milliseconds."""
+    took = [one for person in people for one in list(person)[FIRST:]]
     return {
         "strategy": label,
         "measured": where,
@@ -94,26 +98,28 @@ def main() -> None:
     typed = start(parser)
     if typed.think < 0.4:
         parser.error("--think: expected at least 0.4, as the page takes no answer sooner")
+    gc.disable()  # .2 s of this process would be taken for the server's
     rows: list[Row] = []
     browser = Browser()
     for label, options in tqdm(STUDIES.items(), desc="strategies"):
         with tempfile.TemporaryDirectory() as scratch:
             common = f"setup.budget={BUDGET}", "task=driver", f"pool.size={typed.size}", *options
             server = Server(f"hydra.run.dir={scratch}/study", *common)
-            rows.append(row(label, "server", typed.size, list(over_http(server, typed.think))))
+            people = [over_http(server, code, typed.think) for code in PEOPLE]
+            rows.append(row(label, "server", typed.size, people))
             server.close()
             server = Server(f"hydra.run.dir={scratch}/other", *common)
-            took = list(in_browser(server, browser, typed.think))
-            rows.append(row(label, "Chromium", typed.size, took))
+            people = [in_browser(server, browser, typed.think)]
+            rows.append(row(label, "Chromium", typed.size, people))
             server.close()
     browser.close()
     title = (
         f"From an answer to the next question, Driver, each answered after {typed.think:g} s; of "
-        f"{BUDGET} answers all but the first {FIRST}"
+        f"{BUDGET} answers all but the first {FIRST}; {len(PEOPLE)} people over HTTP, 1 in Chromium"
     )
     report(title, rows, typed.json)
     limits = {"server": 30.0, "Chromium": 100.0}
-    raise SystemExit(any(one["median ms"] > limits[one["measured"]] for one in rows))
+    raise SystemExit(any(one["95% ms"] > limits[one["measured"]] for one in rows))
 
 
 if __name__ == "__main__":

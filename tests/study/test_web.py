@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import time
 from collections.abc import Iterator
@@ -9,12 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import uvicorn
 from PIL import Image
 from starlette.testclient import TestClient
 from study_helpers import client_of, study_of
 
 from torchrl_pref.study.log import LogError
-from torchrl_pref.study.serve import Address, listening_at, read_address, write_address
+from torchrl_pref.study.serve import Address, listening_at, read_address, serve, write_address
 from torchrl_pref.study.study import Study
 
 JSON = {"content-type": "application/json"}
@@ -366,3 +368,16 @@ def test_a_study_is_found_at_the_same_link_when_it_goes_on(tmp_path: Path) -> No
     for spoiled in ("", "[]", '{"port": 1}', '{"port": 99999, "token": "x"}', '{"port": null}'):
         (tmp_path / "address.json").write_text(spoiled)
         assert read_address(tmp_path) == Address()
+
+
+def test_nobody_waits_until_all_that_was_imported_is_gone_through_for_garbage(
+    study: Study, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left_alone: list[int] = []
+    monkeypatch.setattr(
+        uvicorn.Server, "run", lambda self, sockets: left_alone.append(gc.get_freeze_count())
+    )
+    with listening_at(study.folder, "127.0.0.1", 0) as listening:
+        serve(study, listening, "127.0.0.1", open_page=False)
+    gc.unfreeze()
+    assert left_alone[0] > 10_000

@@ -151,15 +151,18 @@ class Study:
         return self.people[code]
 
     def state(self, person: Participant) -> dict[str, Any]:
-        """What a page shows of a participant; from now on their answers are thought ahead.
+        """What a page shows of a participant.
 
         Raises:
             LogError: the next question could not be written down yet.
         """
         person.go_to_next()
-        state = state_of(person, self.materials, self.scenes)
+        return state_of(person, self.materials, self.scenes)
+
+    def think_of(self, person: Participant) -> None:
+        """Think ahead of what a participant may answer: once they see the question, as thinking
+        would slow down what is still to be sent."""
         self._to_think.put(person)
-        return state
 
     def think_ahead(self) -> None:
         """From now on think of what follows the answers, in a thread of its own.

@@ -14,6 +14,7 @@ from importlib.resources import files
 from typing import Any
 
 from starlette.applications import Starlette
+from starlette.background import BackgroundTask
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
@@ -162,7 +163,8 @@ def _endpoint(study: Study, token: str | None, handler: Handler) -> Callable[[Re
                     state = None if error.person is None else study.state(error.person)
                     return _sentence(error.status, str(error), state)
                 if isinstance(result, Participant):
-                    result = study.state(result)
+                    after = BackgroundTask(study.think_of, result)  # once the reply is sent
+                    return JSONResponse(study.state(result), background=after)
             except LogError as error:
                 return _sentence(503, str(error))
             return result if isinstance(result, Response) else JSONResponse(result)

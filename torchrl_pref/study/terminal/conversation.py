@@ -110,6 +110,7 @@ class Conversation:
                 self._end(state)
             else:
                 self._ask(state)
+            self._study.think_of(self._person)
             more = self._listen(state)
 
     def _ask(self, state: dict[str, Any]) -> None:

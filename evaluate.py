@@ -42,10 +42,12 @@ PROTOCOL_KEYS = (
     "setup.offers",
     "strategy",
     "evaluation.metrics",
-    "belief.",
+    "belief",
+    "human",
+    "question",
     "task",
-    "task.",
     "tasks",
+    "tau",
     "pool.size",
     "pool.options",
     "pool.seed",
@@ -208,7 +210,12 @@ def run_heldout(settings: Settings) -> Records:
     learned: dict[Cell, list[Checkpoint]] = {}
     for checkpoint in checkpoints:
         own = checkpoint.settings
-        for tau in ("noisy", "optimal") if checkpoint.of_every_task else (own["tau"],):
+        if typed.was_typed("tau") and not checkpoint.of_every_task:
+            raise InputError(
+                f"tau=…: a policy of one task is judged by the humans of its training, tau="
+                f"{own['tau']}; remove tau"
+            )
+        for tau in listed(settings["tau"]) if checkpoint.of_every_task else (own["tau"],):
             learned.setdefault(Cell(own["setup"]["name"], tau), []).append(checkpoint)
     return heldout.run_protocol(
         tasks_of(settings), learned, settings["workers"], list(own_strategies(settings))

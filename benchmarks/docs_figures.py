@@ -271,6 +271,26 @@ def every_row(cell: str, records: Records) -> dict[str, str]:
     }
 
 
+BEYOND = {
+    "24 features": "task=gaussian task.dimension=24 task.skew=3000 belief=laplace",
+    "weak": "task=driver question=weak",
+    "rankings of 3": "task=driver question=ranking pool.options=3",
+    "tau unknown": "task=driver belief=rationality",
+}
+"""What else than choices between two options is tried, by name; its humans are noisy."""
+
+
+def beyond(folder: Path) -> dict[str, str]:
+    """The policy for every task beside both rules where questions or beliefs are others."""
+    rows = []
+    for setup, name in product(("query", "feed"), BEYOND):
+        records = read_records(folder / name.replace(" ", "_") / CSV)
+        cell = next(cell for cell in records.tasks if cell.startswith(setup))
+        row = every_row(cell, records.of_task(cell))
+        rows.append({"setup": setup, "what": name, **dict(list(row.items())[2:])})
+    return {"tasks-beyond": table(rows)}
+
+
 TAUS = ("noisy", "optimal")
 HELDOUT, SMALLER = "python evaluate.py protocol=heldout", "pool.size=300"
 MADE_FOR_IT = ",".join(
@@ -354,6 +374,15 @@ PARTS: dict[str, Part] = {
         ),
         40,
         tasks,
+    ),
+    "beyond": Part(
+        "docs/results.md",
+        tuple(
+            f"{HELDOUT} {SMALLER} {typed} tau=noisy hydra.run.dir={{folder}}/{key} -> {key}/{CSV}"
+            for key, typed in ((name.replace(" ", "_"), BEYOND[name]) for name in BEYOND)
+        ),
+        25,
+        beyond,
     ),
     "batches": measured("batches", "docs/batches.md", 20),
     "answers": measured("answers", "docs/questions.md", 3, "--plot {folder}/answers.png"),

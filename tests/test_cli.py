@@ -25,6 +25,7 @@ from scripts import run_script
 from torchrl_pref.checkpoints.checkpoint import Checkpoint
 from torchrl_pref.config.study import ONLY_SIMULATED
 from torchrl_pref.pool import QueryPool
+from torchrl_pref.pretrained import FOLDER
 from torchrl_pref.tasks.gridworld import gridworld_pool
 from torchrl_pref.training.progress import Progress
 
@@ -352,6 +353,11 @@ BAD_INPUT = [
     ("evaluate", "strategy=builtins:len protocol=heldout", "making it for a QueryEnv fails"),
     ("train", "+strategy=mine:rule", "strategy='mine:rule': there is no such key here"),
     ("evaluate", "protocol=heldout setup=query", "setup=query: protocol=… brings its own"),
+    (
+        "evaluate",
+        f"protocol=heldout tau=noisy checkpoint={FOLDER / 'query-noisy-0.pt'}",
+        "judged by the humans of its training",
+    ),
     ("evaluate", "objective=entropy", "objective=… is what a policy is trained for"),
     ("evaluate", "tau=[]", "tau=[]: expected at least one"),
     ("evaluate", "checkpoint=[]", "checkpoint=[]: expected at least one"),
@@ -363,6 +369,11 @@ BAD_INPUT = [
     ("train", "training.problems=drawn policy=paper", "type policy=scorer"),
     ("train", "training.problems=drawn training.steps=5", "leave training.steps out"),
     ("evaluate", "protocol=heldout workers=0", "workers=0: expected a whole number"),
+    (
+        "evaluate",
+        "protocol=heldout tau=noisy question=weak belief=laplace human=drifting workers=0",
+        "workers=0: expected a whole number",
+    ),
     ("train", "belief=5", "Config group override must be a string"),
     ("train", "pool=5", "pool is a section of keys"),
     ("train", "setup.name=query", "type setup=query"),

@@ -367,6 +367,11 @@ BAD_INPUT = [
     ("evaluate", "protocol=heldout tasks=driver task=lds", "remove task, or tasks"),
     ("evaluate", "protocol=heldout tasks=[fun]", "tasks='fun': expected one of gridworld"),
     ("train", "training.problems=drawn policy=paper", "type policy=scorer"),
+    (
+        "train",
+        "training.problems=drawn belief=my_belief:Weighted belief.draws=500",
+        "a belief that has no belief.samples",
+    ),
     ("train", "training.problems=drawn training.steps=5", "leave training.steps out"),
     ("evaluate", "protocol=heldout workers=0", "workers=0: expected a whole number"),
     (

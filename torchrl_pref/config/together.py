@@ -83,8 +83,8 @@ def check_drawn(settings: Plain) -> None:
     """Refuse what a training over many problems cannot be made with.
 
     Raises:
-        InputError: the policy is bound to one number of features, batches are no whole sessions, or
-            pools of the user's are named.
+        InputError: the policy is bound to one number of features, batches are no whole sessions,
+            pools of the user's are named, or the belief does not say how many samples it has.
     """
     policy, pool = settings["policy"]["name"], settings["pool"]
     if settings["training"]["problems"] != "drawn":
@@ -104,6 +104,11 @@ def check_drawn(settings: Plain) -> None:
         raise InputError(
             f"training.problems=drawn with pool.train={pool['train']}: each update draws a pool of "
             "its own; remove the pools, or type training.problems=one"
+        )
+    if "samples" not in settings["belief"]:
+        raise InputError(
+            "training.problems=drawn with a belief that has no belief.samples: the belief is "
+            "drawn, too, with as many samples as that says; type belief=sampled"
         )
 
 

@@ -83,7 +83,8 @@ def run_protocol(
 def _jobs(
     settings: Settings, learned: Mapping[Cell, Sequence[Checkpoint]], own: Sequence[str]
 ) -> list[Job]:
-    """A job for each pool of each cell, whose thresholds are yet to be fitted."""
+    """A job for each pool of each cell, whose thresholds are yet to be fitted; those of a pool
+    follow one another."""
     jobs, task = [], make("task", settings["task"])
     for cell, checkpoints in learned.items():
         for checkpoint in checkpoints:
@@ -99,7 +100,7 @@ def _jobs(
             for each, count in cells
             for pool in range(count)
         ]
-    return jobs
+    return sorted(jobs, key=lambda job: job.pool)
 
 
 def features_of(settings: Settings) -> str:

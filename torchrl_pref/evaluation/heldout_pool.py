@@ -5,10 +5,11 @@ Shapes: B humans.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
-from typing import NamedTuple
+from functools import lru_cache, partial
+from typing import NamedTuple, cast
 
 import torch
 from tensordict.nn import TensorDictModuleBase
@@ -116,12 +117,20 @@ class Job:
 def task_and_pool(job: Job) -> tuple[Problem, QueryPool]:
     """The task, with tau solved on the training pool, and the job's own test pool."""
     settings = job.settings
-    # A pool takes two seeds.
-    train, test = make_pools(settings, FIRST_SEED + 2 * job.pool)
+    train, test = _pools(json.dumps(settings["task"]), json.dumps(settings["pool"]), job.pool)
     if job.cell.features == "balanced":
         train, test = (each.map_features(balance(train.features)) for each in (train, test))
     task = make_task(train, test, job.cell.tau, settings)
     return task, task.test
+
+
+@lru_cache(maxsize=1)
+def _pools(task: str, pool: str, number: int) -> tuple[QueryPool, QueryPool]:
+    """Training and test pool of a number, by settings as JSON: kept until the next, as the cells of
+    a pool follow one another and a simulator is slow."""
+    sections = {"task": json.loads(task), "pool": json.loads(pool)}
+    # A pool takes two seeds.
+    return make_pools(cast(Settings, sections), FIRST_SEED + 2 * number)
 
 
 def run_pool(job: Job) -> list[Entry]:

@@ -419,6 +419,15 @@ PARTS: dict[str, Part] = {
         pictures,
     ),
     "room": measured("room", "docs/strategies.md", 40),
+    "room_finer": Part(
+        "docs/strategies.md",
+        (
+            'python benchmarks/room.py --pools 16 --only "D=8;tau unknown" '
+            "--json {folder}/room_finer.json -> room_finer.json",
+        ),
+        8,
+        benchmark("room_finer"),
+    ),
     "room_feed": Part(
         "docs/strategies.md",
         (

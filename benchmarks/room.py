@@ -3,7 +3,9 @@
 In each corner of the space of tasks the same humans are asked by information gain, expected
 alignment, both mixed (information early, alignment late), and expected alignment judged by four
 times as many samples. In the query setup the most valuable question is asked, and what looks two
-(of short sessions three) questions ahead at the alignment itself is tried, too. In a feed an offer
+(of short sessions three) questions ahead at the alignment itself is tried, too; *100 of 400* is a
+belief of four times as many samples, a quarter of which choose: it tells whether the choice gains
+by them, or the belief. In a feed an offer
 is asked that ranks among the best share, asks left over offers left (a quantile rule); *patient*
 and *eager* multiply that share by .6 and 1.6.
 
@@ -53,9 +55,9 @@ from torchrl_pref.tasks.gaussian import GaussianTask
 FIRST_SEED = 900_000
 """Of the pools, far from those of any training or test."""
 
-BASELINE, FINE = "alignment", "400 samples"
+BASELINE, FINE, PART = "alignment", "400 samples", "100 of 400"
 TRIED = {
-    "query": ("2 ahead", "3 ahead", "mixed", "information", "400 samples"),
+    "query": ("2 ahead", "3 ahead", "mixed", "information", "400 samples", "100 of 400"),
     "feed": ("mixed", "information", "400 samples", "patient", "eager"),
 }
 PATIENT, EAGER = 0.6, 1.6
@@ -145,6 +147,19 @@ class Mixed(TensorDictModuleBase):
         return tensordict.set("action", (left * first + (1 - left) * last).argmax(-1))
 
 
+class ByAQuarter(Greedy):
+    """Greedy by expected alignment as every fourth sample tells it."""
+
+    def __init__(self, model: ResponseModel) -> None:
+        super().__init__(model, alignment_gain)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action`` (B)."""
+        shown = tensordict.select(*self.in_keys)
+        shown["samples"] = shown["samples"][:, ::4]
+        return tensordict.set("action", super().forward(shown)["action"])
+
+
 @dataclass
 class Found:
     """Alignment of each strategy with the humans of all pools (pools · B, H)."""
@@ -187,7 +202,7 @@ def tried_in_pools(budget: int) -> Tried:
     }
     if budget <= SHORT:
         tried["3 ahead"] = lambda env: AlignmentLookahead(env.belief.response_model, 3)
-    return {**tried, FINE: tried[BASELINE]}
+    return {**tried, FINE: tried[BASELINE], PART: lambda env: ByAQuarter(env.belief.response_model)}
 
 
 def tried_in_feeds() -> Tried:
@@ -227,7 +242,7 @@ def measure(corner: Corner, setup: str, pools: int, humans: int) -> Found:
         human = SimulatedHuman(model, 4.0 if corner.unknown else 1.0)
         common = {"budget": corner.budget, "batch_size": (humans,), "seed": FIRST_SEED + number}
         for name, make_strategy in tried.items():
-            samples = 400 if name == FINE else 100
+            samples = 400 if name in (FINE, PART) else 100
             belief = (RationalityBelief if corner.unknown else Belief)(model, samples=samples)
             env: QueryEnv | FeedEnv
             if setup == "feed":

@@ -272,9 +272,11 @@ def every_row(cell: str, records: Records) -> dict[str, str]:
 
 
 BEYOND = {
+    "2 features": "task=gaussian task.dimension=2 setup.budget=10",
+    "8 features": "task=gaussian task.dimension=8 setup.budget=10",
     "24 features": "task=gaussian task.dimension=24 task.skew=3000 belief=laplace",
     "weak": "task=driver question=weak",
-    "rankings of 3": "task=driver question=ranking pool.options=3",
+    "rankings of 3": "task=driver question=ranking pool.options=3 setup.budget=5",
     "tau unknown": "task=driver belief=rationality",
 }
 """What else than choices between two options is tried, by name; its humans are noisy."""

@@ -276,7 +276,6 @@ BEYOND = {
     "8 features": "task=gaussian task.dimension=8 setup.budget=10",
     "24 features": "task=gaussian task.dimension=24 task.skew=3000 belief=laplace",
     "weak": "task=driver question=weak",
-    "rankings of 3": "task=driver question=ranking pool.options=3 setup.budget=5",
     "tau unknown": "task=driver belief=rationality",
 }
 """What else than choices between two options is tried, by name; its humans are noisy."""

@@ -99,16 +99,18 @@ def main() -> None:
     if typed.think < 0.4:
         parser.error("--think: expected at least 0.4, as the page takes no answer sooner")
     gc.disable()  # .2 s of this process would be taken for the server's
-    rows: list[Row] = []
-    browser = Browser()
-    for label, options in tqdm(STUDIES.items(), desc="strategies"):
+    common = f"setup.budget={BUDGET}", "task=driver", f"pool.size={typed.size}"
+    rows = []
+    for label, options in tqdm(STUDIES.items(), desc="over HTTP"):
         with tempfile.TemporaryDirectory() as scratch:
-            common = f"setup.budget={BUDGET}", "task=driver", f"pool.size={typed.size}", *options
-            server = Server(f"hydra.run.dir={scratch}/study", *common)
+            server = Server(f"hydra.run.dir={scratch}/study", *common, *options)
             people = [over_http(server, code, typed.think) for code in PEOPLE]
             rows.append(row(label, "server", typed.size, people))
             server.close()
-            server = Server(f"hydra.run.dir={scratch}/other", *common)
+    browser = Browser()  # and not before: it would take of the server's time
+    for label, options in tqdm(STUDIES.items(), desc="in Chromium"):
+        with tempfile.TemporaryDirectory() as scratch:
+            server = Server(f"hydra.run.dir={scratch}/study", *common, *options)
             people = [in_browser(server, browser, typed.think)]
             rows.append(row(label, "Chromium", typed.size, people))
             server.close()

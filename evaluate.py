@@ -209,17 +209,29 @@ def run_heldout(settings: Settings) -> Records:
         checkpoints = [Checkpoint.load(path) for path in paths]
     learned: dict[Cell, list[Checkpoint]] = {}
     for checkpoint in checkpoints:
-        own = checkpoint.settings
-        if typed.was_typed("tau") and not checkpoint.of_every_task:
-            raise InputError(
-                f"tau=…: a policy of one task is judged by the humans of its training, tau="
-                f"{own['tau']}; remove tau"
-            )
-        for tau in listed(settings["tau"]) if checkpoint.of_every_task else (own["tau"],):
-            learned.setdefault(Cell(own["setup"]["name"], tau), []).append(checkpoint)
+        for tau in taus_for(settings, checkpoint):
+            cell = Cell(checkpoint.settings["setup"]["name"], tau)
+            learned.setdefault(cell, []).append(checkpoint)
     return heldout.run_protocol(
         tasks_of(settings), learned, settings["workers"], list(own_strategies(settings))
     )
+
+
+def taus_for(settings: Settings, checkpoint: Checkpoint) -> list[Any]:
+    """The kinds of human by whom the protocol judges a policy.
+
+    Raises:
+        InputError: others were typed for a policy of one task.
+    """
+    if checkpoint.of_every_task:
+        return listed(settings["tau"])
+    own = checkpoint.settings["tau"]
+    if typed.was_typed("tau"):
+        raise InputError(
+            f"tau=…: a policy of one task is judged by the humans of its training, tau={own}; "
+            "remove tau"
+        )
+    return [own]
 
 
 def check_tasks(settings: Plain) -> None:

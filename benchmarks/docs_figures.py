@@ -252,8 +252,13 @@ def tasks(folder: Path) -> dict[str, str]:
 
 
 def every_row(cell: str, records: Records) -> dict[str, str]:
-    """The policy beside both rules in one cell, in the mean over the questions."""
+    """One cell of the policy for every task."""
     setup, tau, task = cell.split("/")
+    return {"setup, human": f"{setup}, {tau}", "task": task, **beside_rules(setup, records)}
+
+
+def beside_rules(setup: str, records: Records) -> dict[str, str]:
+    """The policy beside both rules of a setup, in the mean over the questions."""
     policy = next(key for key in records.strategies if is_judged(key))
     rule = "quantile" if setup == "feed" else "greedy"
     information, rule_alignment = f"{rule}_information", f"{rule}_alignment"
@@ -262,8 +267,6 @@ def every_row(cell: str, records: Records) -> dict[str, str]:
         return interval(difference(records, first, second)[..., 1:].mean(-1))
 
     return {
-        "setup, human": f"{setup}, {tau}",
-        "task": task,
         "by information": f"{alignment(records, information)[..., 1:].mean():.3f}",
         "alignment − information": gap(rule_alignment, information),
         "RL − information": gap(policy, information),
@@ -272,11 +275,11 @@ def every_row(cell: str, records: Records) -> dict[str, str]:
 
 
 BEYOND = {
-    "2 features": "task=gaussian task.dimension=2 setup.budget=10",
-    "8 features": "task=gaussian task.dimension=8 setup.budget=10",
-    "24 features": "task=gaussian task.dimension=24 task.skew=3000 belief=laplace",
+    "2_features": "task=gaussian task.dimension=2 setup.budget=10",
+    "8_features": "task=gaussian task.dimension=8 setup.budget=10",
+    "24_features": "task=gaussian task.dimension=24 task.skew=3000 belief=laplace",
     "weak": "task=driver question=weak",
-    "tau unknown": "task=driver belief=rationality",
+    "tau_unknown": "task=driver belief=rationality",
 }
 """What else than choices between two options is tried, by name; its humans are noisy."""
 
@@ -285,10 +288,10 @@ def beyond(folder: Path) -> dict[str, str]:
     """The policy for every task beside both rules where questions or beliefs are others."""
     rows = []
     for setup, name in product(("query", "feed"), BEYOND):
-        records = read_records(folder / name.replace(" ", "_") / CSV)
+        records = read_records(folder / name / CSV)
         cell = next(cell for cell in records.tasks if cell.startswith(setup))
-        row = every_row(cell, records.of_task(cell))
-        rows.append({"setup": setup, "what": name, **dict(list(row.items())[2:])})
+        row = beside_rules(setup, records.of_task(cell))
+        rows.append({"setup": setup, "what": name.replace("_", " "), **row})
     return {"tasks-beyond": table(rows)}
 
 
@@ -312,9 +315,13 @@ def trained(name: str, *settings: str) -> Iterator[str]:
     yield f"{evaluation} -> {name}-evaluated/{CSV}"
 
 
-def measured(name: str, page: str, minutes: float, more: str = "") -> Part:
-    """A benchmark that writes its table as JSON."""
-    command = f"python benchmarks/{name}.py {more} --json {{folder}}/{name}.json -> {name}.json"
+def measured(
+    name: str, page: str, minutes: float, more: str = "", script: str | None = None
+) -> Part:
+    """A benchmark that writes its table as JSON: of the part's name, or another."""
+    command = (
+        f"python benchmarks/{script or name}.py {more} --json {{folder}}/{name}.json -> {name}.json"
+    )
     return Part(page, (command,), minutes, benchmark(name))
 
 
@@ -379,8 +386,8 @@ PARTS: dict[str, Part] = {
     "beyond": Part(
         "docs/results.md",
         tuple(
-            f"{HELDOUT} {SMALLER} {typed} tau=noisy hydra.run.dir={{folder}}/{key} -> {key}/{CSV}"
-            for key, typed in ((name.replace(" ", "_"), BEYOND[name]) for name in BEYOND)
+            f"{HELDOUT} {SMALLER} {typed} tau=noisy hydra.run.dir={{folder}}/{name} -> {name}/{CSV}"
+            for name, typed in BEYOND.items()
         ),
         25,
         beyond,
@@ -420,24 +427,10 @@ PARTS: dict[str, Part] = {
         pictures,
     ),
     "room": measured("room", "docs/strategies.md", 40),
-    "room_finer": Part(
-        "docs/strategies.md",
-        (
-            'python benchmarks/room.py --pools 16 --only "D=8;tau unknown" '
-            "--json {folder}/room_finer.json -> room_finer.json",
-        ),
-        8,
-        benchmark("room_finer"),
+    "room_finer": measured(
+        "room_finer", "docs/strategies.md", 8, '--pools 16 --only "D=8;tau unknown"', "room"
     ),
-    "room_feed": Part(
-        "docs/strategies.md",
-        (
-            "python benchmarks/room.py --setup feed --json {folder}/room_feed.json "
-            "-> room_feed.json",
-        ),
-        40,
-        benchmark("room_feed"),
-    ),
+    "room_feed": measured("room_feed", "docs/strategies.md", 40, "--setup feed", "room"),
     "large_pool": measured("large_pool", "docs/speed.md", 1),
     "aprel": Part(
         "docs/aprel.md",

@@ -5,9 +5,8 @@ alignment, both mixed (information early, alignment late), and expected alignmen
 times as many samples. In the query setup the most valuable question is asked, and what looks two
 (of short sessions three) questions ahead at the alignment itself is tried, too; *100 of 400* is a
 belief of four times as many samples, a quarter of which choose: it tells whether the choice gains
-by them, or the belief. In a feed an offer
-is asked that ranks among the best share, asks left over offers left (a quantile rule); *patient*
-and *eager* multiply that share by .6 and 1.6.
+by them, or the belief. In a feed an offer is asked that ranks among the best share, asks left over
+offers left (a quantile rule); *patient* and *eager* multiply that share by .6 and 1.6.
 
 The columns are how much more each is than expected alignment alone, in the mean alignment over all
 questions. *Room* is that of the one that is best on every other pool, on the remaining pools; ± is
@@ -57,8 +56,8 @@ FIRST_SEED = 900_000
 
 BASELINE, FINE, PART = "alignment", "400 samples", "100 of 400"
 TRIED = {
-    "query": ("2 ahead", "3 ahead", "mixed", "information", "400 samples", "100 of 400"),
-    "feed": ("mixed", "information", "400 samples", "patient", "eager"),
+    "query": ("2 ahead", "3 ahead", "mixed", "information", FINE, PART),
+    "feed": ("mixed", "information", FINE, "patient", "eager"),
 }
 PATIENT, EAGER = 0.6, 1.6
 """How a quantile rule's share is multiplied."""

@@ -20,6 +20,7 @@ import statistics
 import tempfile
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 
 from tqdm import tqdm
 
@@ -55,6 +56,17 @@ const begun = performance.now();
 dispatchEvent(new KeyboardEvent("keydown", { key }));
 """
 """Press a key; the milliseconds until the next question was painted."""
+
+
+@contextmanager
+def serving(*options: str) -> Iterator[Server]:
+    """The server of a new study, for the length of the block."""
+    with tempfile.TemporaryDirectory() as scratch:
+        server = Server(f"hydra.run.dir={scratch}/study", *options)
+        try:
+            yield server
+        finally:
+            server.close()
 
 
 def over_http(server: Server, code: str, think: float) -> Iterator[float]:
@@ -102,18 +114,14 @@ def main() -> None:
     common = f"setup.budget={BUDGET}", "task=driver", f"pool.size={typed.size}"
     rows = []
     for label, options in tqdm(STUDIES.items(), desc="over HTTP"):
-        with tempfile.TemporaryDirectory() as scratch:
-            server = Server(f"hydra.run.dir={scratch}/study", *common, *options)
+        with serving(*common, *options) as server:
             people = [over_http(server, code, typed.think) for code in PEOPLE]
             rows.append(row(label, "server", typed.size, people))
-            server.close()
     browser = Browser()  # and not before: it would take of the server's time
     for label, options in tqdm(STUDIES.items(), desc="in Chromium"):
-        with tempfile.TemporaryDirectory() as scratch:
-            server = Server(f"hydra.run.dir={scratch}/study", *common, *options)
+        with serving(*common, *options) as server:
             people = [in_browser(server, browser, typed.think)]
             rows.append(row(label, "Chromium", typed.size, people))
-            server.close()
     browser.close()
     title = (
         f"From an answer to the next question, Driver, each answered after {typed.think:g} s; of "

@@ -27,6 +27,7 @@ from torchrl_pref.evaluation.heldout_pool import (
     Cell,
     Job,
     fit_threshold,
+    pools_of,
     run_pool,
     try_job,
 )
@@ -59,6 +60,7 @@ def run_protocol(
         InputError: a policy was trained for another budget or cannot face the same offers as the
             others, or a strategy of the user cannot decide.
     """
+    pools_of.cache_clear()  # a file of before may hold something else now
     jobs = [job for settings in tasks for job in _jobs(settings, learned, own)]
     for job in jobs:
         if job.pool == 0:

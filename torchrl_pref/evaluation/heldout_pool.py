@@ -117,7 +117,8 @@ class Job:
 def task_and_pool(job: Job) -> tuple[Problem, QueryPool]:
     """The task, with tau solved on the training pool, and the job's own test pool."""
     settings = job.settings
-    train, test = _pools(json.dumps(settings["task"]), json.dumps(settings["pool"]), job.pool)
+    sections = {"task": settings["task"], "pool": settings["pool"]}
+    train, test = pools_of(json.dumps(sections), job.pool)
     if job.cell.features == "balanced":
         train, test = (each.map_features(balance(train.features)) for each in (train, test))
     task = make_task(train, test, job.cell.tau, settings)
@@ -125,12 +126,11 @@ def task_and_pool(job: Job) -> tuple[Problem, QueryPool]:
 
 
 @lru_cache(maxsize=1)
-def _pools(task: str, pool: str, number: int) -> tuple[QueryPool, QueryPool]:
+def pools_of(sections: str, number: int) -> tuple[QueryPool, QueryPool]:
     """Training and test pool of a number, by settings as JSON: kept until the next, as the cells of
     a pool follow one another and a simulator is slow."""
-    sections = {"task": json.loads(task), "pool": json.loads(pool)}
     # A pool takes two seeds.
-    return make_pools(cast(Settings, sections), FIRST_SEED + 2 * number)
+    return make_pools(cast(Settings, json.loads(sections)), FIRST_SEED + 2 * number)
 
 
 def run_pool(job: Job) -> list[Entry]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import ipaddress
 import json
 import os
@@ -87,10 +86,6 @@ def serve(study: Study, listening: socket.socket, host: str, open_page: bool) ->
     if open_page and has_display():
         webbrowser.open(link)
     study.think_ahead()
-    # What is there now stays: else it is gone through for garbage again and again, .3 s each time
-    # in which nobody is answered.
-    gc.collect()
-    gc.freeze()
     config = uvicorn.Config(
         make_app(study, hosts if local else (), token),
         log_level="warning",

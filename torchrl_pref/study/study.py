@@ -6,6 +6,7 @@ ahead of what the people there may answer.
 
 from __future__ import annotations
 
+import gc
 import queue
 import threading
 import time
@@ -174,6 +175,10 @@ class Study:
             with suppress(NothingToAsk):
                 session.ask()
                 session.tell(0)
+        # What is there now stays: else it is gone through for garbage again and again, .3 s each
+        # time in which nobody is answered.
+        gc.collect()
+        gc.freeze()
         self._thinker = threading.Thread(target=self._think, daemon=True)
         self._thinker.start()
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -67,6 +68,7 @@ def check(settings: Plain) -> Plain:
         typed.refuse_other_overrides("export", ("threads", *code), own)
     elif settings["resume"] is not None:
         typed.refuse_other_overrides("resume", (*BESIDE_RESUME, *code), own)
+    typed.refuse_idle_cost([settings["strategy"]])
     app.allow_typed(settings)
     if code and typed.was_typed("strategy"):
         from torchrl_pref.groups import allow
@@ -141,7 +143,11 @@ def load_settings(key: str, folder: Path) -> Plain:
         raise InputError(f"{folder / CONFIG}: cannot be read ({error}); restore it") from error
     if not isinstance(settings, dict):
         raise InputError(f"{folder / CONFIG}: holds no settings; restore it")
-    return check_ask_settings({str(name): value for name, value in settings.items()})
+    from torchrl_pref.acquisition.per_second import Cost
+
+    plain = {str(name): value for name, value in settings.items()}
+    plain.setdefault("cost", asdict(Cost()))  # of a study begun before it was a setting
+    return check_ask_settings(plain)
 
 
 def load_study(folder: Path, settings: Plain) -> Study:

@@ -41,6 +41,7 @@ PROTOCOL_KEYS = (
     "setup.budget",
     "setup.offers",
     "strategy",
+    "cost.",
     "evaluation.metrics",
     "belief",
     "human",
@@ -108,7 +109,7 @@ def check(settings: Plain) -> Settings:
                 "policy=pretrained and checkpoint=… name two policies; expected one of "
                 "them; pretrained policies are files too: checkpoint=[a.pt,b.pt]"
             )
-        allowed = ("evaluation.", "pool.test", "strategy", "device", "threads", "hydra.")
+        allowed = ("evaluation.", "pool.test", "strategy", "cost.", "device", "threads", "hydra.")
         typed.refuse_other_overrides("checkpoint", allowed, own)
     app.allow_typed(settings)
     if settings.get("checkpoint") is not None:
@@ -119,6 +120,7 @@ def check(settings: Plain) -> Settings:
             "trained; add checkpoint=<its run folder>, or name a strategy by strategy="
         )
     checked = check_evaluate_settings(settings)
+    typed.refuse_idle_cost(listed(checked["strategy"]))
     for each in tasks_of(checked):
         app.check_groups({**each})
     own_strategies(checked)
@@ -158,9 +160,10 @@ def own_strategies(settings: Settings) -> dict[str, Maker]:
     """
     if settings["strategy"] is None:
         return {}
+    from torchrl_pref.acquisition.per_second import Cost
     from torchrl_pref.evaluation.own import find_makers
 
-    return find_makers(listed(settings["strategy"]))
+    return find_makers(listed(settings["strategy"]), Cost(**settings["cost"]))
 
 
 def evaluate_taus(

@@ -10,7 +10,7 @@ import re
 import shlex
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -21,6 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from help_text import CONF, keys_of
+from torchrl_pref.config.checks import COST, PER_SECOND
 from torchrl_pref.config.sections import CODE, Plain
 from torchrl_pref.errors import InputError, one_line_errors
 
@@ -225,6 +226,21 @@ def typed_overrides() -> list[str]:
 def was_typed(key: str) -> bool:
     """Whether the user typed a value for a key."""
     return any(override.split("=")[0].lstrip("+") == key for override in typed_overrides())
+
+
+def refuse_idle_cost(strategies: Sequence[str]) -> None:
+    """Refuse seconds that were typed for strategies none of which counts them.
+
+    Raises:
+        InputError: they were.
+    """
+    idle = [key for key in COST if was_typed(key)]
+    if idle and not set(PER_SECOND) & set(strategies):
+        raise InputError(
+            f"{idle[0]}: no strategy here counts the seconds of a question; expected "
+            f"{' or '.join(f'strategy={name}' for name in PER_SECOND)}; type one, or remove "
+            f"{idle[0]}"
+        )
 
 
 def typed_code() -> list[str]:

@@ -416,6 +416,8 @@ BAD_INPUT = [
     ("ask", "-m tau=1,2", "people answer one study at a time"),
     ("evaluate", "setup=query setup.batch=10 strategy=max_regret", "chooses one query at a time"),
     ("evaluate", "strategy=lookahead", "strategy=lookahead with setup=feed"),
+    ("evaluate", "strategy=alignment_gain cost.watch=3", "cost.watch: no strategy here counts"),
+    ("ask", "cost.decide=3", "cost.decide: no strategy here counts"),
     ("evaluate", "task=gaussian task.dimension=9999", "expected a whole number from 2 to 1000"),
     ("evaluate", "evaluation.seed=x", "evaluation.seed='x': expected a whole number"),
 ]

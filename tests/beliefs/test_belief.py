@@ -140,6 +140,7 @@ def test_calibration(
 
 CASES = [
     Case(2, 3, 4.5, "contradictory"),
+    Case(2, 3, 30.0, "collinear"),  # a needle of the posterior, which grows by ordinary answers
     Case(2, 2, None, "60 answers"),
     Case(4, 5, 4.5, "surprising"),
     Case(4, 5, 30.0, "surprising"),

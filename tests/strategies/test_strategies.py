@@ -10,6 +10,7 @@ from torch import Generator, Tensor
 from torchrl_pref.acquisition.functions import alignment_gain, information_gain
 from torchrl_pref.acquisition.knowledge_gradient import KnowledgeGradient
 from torchrl_pref.acquisition.pairs import max_regret
+from torchrl_pref.acquisition.per_second import Cost, PerSecond
 from torchrl_pref.acquisition.scoring import predict_answers, score_queries
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.objectives import make_objective
@@ -51,6 +52,26 @@ def test_greedy_asks_what_is_worth_most(pool: QueryPool) -> None:
     session, model = env.reset(), env.belief.response_model
     values = score_queries(session["samples"], session["queries"], model, information_gain)
     assert torch.equal(Greedy(model)(session)["action"], values.argmax(-1))
+
+
+@pytest.mark.parametrize("setup", [QueryEnv, FeedEnv])
+@pytest.mark.parametrize("name", ["information_per_second", "alignment_per_second"])
+def test_seconds_that_are_given_are_those_that_count(
+    name: str, setup: type[QueryEnv | FeedEnv], pool: QueryPool
+) -> None:
+    env, slow = make(setup, pool, batch=300, seed=0), Cost(watch=0.1, decide=1000.0)
+    session, own = env.reset(), {"information": information_gain, "alignment": alignment_gain}
+    expected = PerSecond(own[name.split("_")[0]], slow)
+    if setup is QueryEnv:
+        by_hand = Greedy(env.belief.response_model, expected)(session.clone())["action"]
+    else:
+        by_hand = QuantileAsk(env, expected)(session.clone())["action"]
+    asked = make_strategy(name, env, cost=slow)(session.clone())["action"]
+    assert torch.equal(asked, by_hand)
+    assert not torch.equal(asked, make_strategy(name, env)(session.clone())["action"])
+    greedy = make_strategy("alignment_gain", env)(session.clone())["action"]
+    counted = make_strategy("alignment_gain", env, cost=slow)(session.clone())["action"]
+    assert torch.equal(greedy, counted)
 
 
 def test_greedy_obeys_the_mask(pool: QueryPool) -> None:

@@ -6,8 +6,8 @@ The prior is uniform on the unit sphere: alignment ignores the scale of ω, and 
 After each answer the samples take a step of *resample-move* (Gilks and Berzuini, 2001): reweight by
 the likelihood of the new answer, resample, then move every sample with Markov moves that leave the
 new posterior invariant (see ``slice.py``). An answer that too few samples agree with is let in by
-stages, and one that hardly any sample foresaw makes the belief begin anew from the prior, see
-:meth:`Belief.update`.
+stages, and one that hardly any sample foresaw makes the belief begin anew from the prior, as any
+soft one does where there are two features, see :meth:`Belief.update`.
 """
 
 from __future__ import annotations
@@ -42,6 +42,11 @@ MAX_STAGES = 12
 SURPRISE = 0.1
 """A soft answer makes the belief begin anew where the samples together gave it less than this share
 of the probability that it could have: what none of them is near may then weigh as much."""
+
+CIRCLE = 2
+"""Features of which a belief begins anew with every soft answer. It costs little there, and it is
+there that a needle of the posterior, too narrow for one sample in a hundred, grows to a share that
+counts by answers none of which is a surprise."""
 
 RESTART_SHARE, RESTART_STAGES = 0.5, 500
 """What each stage of a new beginning keeps, and how many stages there may be: it must find every
@@ -103,7 +108,7 @@ class Belief(BeliefBase):
         An answer that hardly any sample foresaw says that most of the posterior may lie where there
         are no samples, which no move would mend. The belief then begins anew from the prior and
         lets in all answers together, by a power of their likelihood that rises to one (Neal,
-        *Annealed importance sampling*, 2001).
+        *Annealed importance sampling*, 2001). Of two features it does so with every soft answer.
 
         The effective sample size follows the samples through it all. Resampling multiplies the
         variance of the mean, by the average multiplicity where all samples count alike; moves after
@@ -128,13 +133,14 @@ class Belief(BeliefBase):
     ) -> Update:
         """:meth:`update` for as many sessions as are held in memory at once."""
         foreseen = self._likelihood(samples, answers[:, -1])
-        surprised = foreseen.exp().mean(1) < SURPRISE
-        if surprised.any():
-            indeed = self._surprised(samples[surprised], answers[surprised])
-            surprised = surprised.masked_scatter(surprised, indeed)
-        few = ~surprised & (kish_share(foreseen) < MIN_SHARE)
+        limit = math.inf if samples.shape[2] == CIRCLE else SURPRISE
+        anew = foreseen.exp().mean(1) < limit
+        if anew.any():
+            indeed = self._surprised(samples[anew], answers[anew], limit)
+            anew = anew.masked_scatter(anew, indeed)
+        few = ~anew & (kish_share(foreseen) < MIN_SHARE)
         inflation = self.n_samples / ess
-        plain = ~(surprised | few)
+        plain = ~(anew | few)
         if plain.all():
             after = self._let_in(samples, inflation, answers, generator)
         else:
@@ -142,7 +148,7 @@ class Belief(BeliefBase):
             for who, condition in (
                 (plain, self._let_in),
                 (few, self._let_in_by_stages),
-                (surprised, self._begin_anew),
+                (anew, self._begin_anew),
             ):
                 if who.any():
                     some = condition(samples[who], inflation[who], answers[who], generator)
@@ -158,8 +164,9 @@ class Belief(BeliefBase):
         model = self.response_model
         return (model.answer_log_likelihood if one else model.joint_log_likelihood)(gaps, floor)
 
-    def _surprised(self, samples: Tensor, answers: Evidence) -> Tensor:
-        """(S), whether samples (S M D) held the last of answers (S H) for too unlikely."""
+    def _surprised(self, samples: Tensor, answers: Evidence, limit: float) -> Tensor:
+        """(S), whether samples (S M D) gave the last of answers (S H) less than this share of what
+        it could have, and it is no answer that could be impossible."""
         newest = answers[:, -1]
         foreseen = self._likelihood(samples, newest).exp()
         # The most that any ω would give it, or nearly: that of the sample or the mean row.
@@ -168,7 +175,7 @@ class Belief(BeliefBase):
         # Where an answer can be impossible no power of its likelihood makes it less so.
         against = Evidence(-answers.rows, answers.offsets, answers.floor)
         possible = self._likelihood(samples, against).isfinite().all(1)
-        return possible & (foreseen.mean(1) < SURPRISE * most)
+        return possible & (foreseen.mean(1) < limit * most)
 
     def _let_in(
         self, samples: Tensor, inflation: Tensor, answers: Evidence, generator: Generator

@@ -27,6 +27,9 @@ EXTRAS = ("wandb", "mlflow")
 """Loggers whose packages are extras, of the same names."""
 
 
+PER_SECOND = ("information_per_second", "alignment_per_second")
+"""Strategies that count the seconds a question takes."""
+
 STRATEGIES = (
     "alignment_gain",
     "information_gain",
@@ -36,8 +39,7 @@ STRATEGIES = (
     "thompson",
     "least_confidence",
     "knowledge_gradient",
-    "information_per_second",
-    "alignment_per_second",
+    *PER_SECOND,
 )
 """Those that either setup knows by name, beside ``random`` (docs/strategies.md)."""
 
@@ -221,3 +223,7 @@ def positive(maximum: float) -> Check:
             )
 
     return check_both
+
+
+COST: dict[str, Check] = {"cost.watch": positive(1e6), "cost.decide": positive(1e6)}
+"""How long a question takes, see ``acquisition.per_second.Cost``."""

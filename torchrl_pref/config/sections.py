@@ -48,6 +48,13 @@ class EvaluationSection(TypedDict):
     during: NotRequired[int]
 
 
+class CostSection(TypedDict):
+    """``cost``: how many seconds a question takes."""
+
+    watch: float
+    decide: float
+
+
 class SetupSection(TypedDict):
     """``setup``: what the action is; which keys there are follows from its name."""
 
@@ -109,6 +116,7 @@ class Settings(TypedDict):
     tasks: NotRequired[str | list[str] | None]
     workers: NotRequired[int]
     strategy: NotRequired[str | list[str] | None]
+    cost: NotRequired[CostSection]
     # Of both: a file to start from, or those to compare.
     checkpoint: NotRequired[Any]
 

@@ -14,6 +14,7 @@ from collections.abc import Mapping
 from typing import Any, cast
 
 from torchrl_pref.config.checks import (
+    COST,
     LARGEST_TAU,
     LARGEST_THREADS,
     ONLY_QUERY,
@@ -114,6 +115,7 @@ EVALUATE: dict[str, Check] = {
     "workers": count(1, LARGEST_THREADS),
     "checkpoint": optional(one_or_more(check_path)),
     "strategy": optional(one_or_more(strategy(*STRATEGIES, *ONLY_QUERY))),
+    **COST,
 }
 """Of evaluate.py."""
 
@@ -186,6 +188,7 @@ SECTIONS = (
     "policy",
     "algorithm",
     "study",
+    "cost",
     *OTHERS,
 )
 

@@ -6,6 +6,7 @@ import re
 from typing import Any
 
 from torchrl_pref.config.checks import (
+    COST,
     LARGEST_THREADS,
     ONLY_QUERY,
     STRATEGIES,
@@ -91,6 +92,7 @@ KEYS: dict[str, Check] = {
     "study.repeats": count(0, 20),
     "study.worth": lambda name, value: check_between(name, value, 0.0, 1.0),
     "belief.lapse": check_share,
+    **COST,
 }
 
 ONLY_SIMULATED = ("setup.candidates", "setup.repeats", "setup.batch", "setup.on_skip")

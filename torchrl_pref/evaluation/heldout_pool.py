@@ -16,6 +16,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_pref.acquisition.functions import alignment_gain, information_gain, volume_removal
+from torchrl_pref.acquisition.per_second import Cost
 from torchrl_pref.build import (
     load_policy,
     make_feed_env,
@@ -30,7 +31,7 @@ from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.envs.session import is_feed
 from torchrl_pref.evaluation.comparison import FIRST_EVALUATION_SEED
 from torchrl_pref.evaluation.metrics import make_exam
-from torchrl_pref.evaluation.own import find_makers, make_own, try_own
+from torchrl_pref.evaluation.own import Maker, find_makers, make_own, try_own
 from torchrl_pref.evaluation.records import Entry, entry_of
 from torchrl_pref.evaluation.run import draw_humans
 from torchrl_pref.evaluation.side_by_side import Entrant, run_side_by_side
@@ -203,7 +204,12 @@ def try_job(job: Job) -> None:
     env = _make_env(job, task, pool, 0, 2)
     for one in (one for checkpoints in job.learned.values() for one in checkpoints):
         load_policy(one, env)
-    try_own(find_makers(job.own), env)
+    try_own(_makers(job), env)
+
+
+def _makers(job: Job) -> dict[str, Maker]:
+    """What makes the strategies of the user."""
+    return find_makers(job.own, Cost(**job.settings["cost"]))
 
 
 def _judged(job: Job, env: QueryEnv | FeedEnv, seed: int, beside: Sequence[str]) -> list[Entrant]:
@@ -213,7 +219,7 @@ def _judged(job: Job, env: QueryEnv | FeedEnv, seed: int, beside: Sequence[str])
         for key, checkpoints in job.learned.items()
         for one in checkpoints
     ]
-    return [*policies, *make_own(find_makers(job.own), env, seed, beside)]
+    return [*policies, *make_own(_makers(job), env, seed, beside)]
 
 
 def _lineup(job: Job, task: Problem, env: QueryEnv | FeedEnv, seed: int) -> list[Entrant]:

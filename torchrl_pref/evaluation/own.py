@@ -19,6 +19,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from torchrl_pref.acquisition.per_second import Cost
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.envs.session import is_feed
@@ -31,11 +32,12 @@ from torchrl_pref.strategies import make_strategy
 Maker = Callable[[QueryEnv | FeedEnv], TensorDictModuleBase]
 
 
-def find_makers(typed: Sequence[str]) -> dict[str, Maker]:
+def find_makers(typed: Sequence[str], cost: Cost) -> dict[str, Maker]:
     """What makes each strategy; for the user's own the current directory is looked in last.
 
     Args:
         typed: a name of the package, or ``module:name``, of each.
+        cost: how long a question takes, for those of the package that count seconds.
 
     Returns:
         What was found or imported, by the same names.
@@ -44,7 +46,9 @@ def find_makers(typed: Sequence[str]) -> dict[str, Maker]:
         InputError: there is no such module or name, or it cannot be called.
     """
     return {
-        name: load(f"strategy={name}", name) if ":" in name else partial(make_strategy, name)
+        name: load(f"strategy={name}", name)
+        if ":" in name
+        else partial(make_strategy, name, cost=cost)
         for name in typed
     }
 

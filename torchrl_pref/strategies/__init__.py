@@ -7,6 +7,7 @@ through the same ``env.rollout``.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 from tensordict.nn import TensorDictModuleBase
@@ -17,6 +18,7 @@ from torchrl_pref.acquisition.batch import BATCHES, Select
 from torchrl_pref.acquisition.functions import Acquisition
 from torchrl_pref.acquisition.knowledge_gradient import KnowledgeGradient
 from torchrl_pref.acquisition.pairs import max_regret
+from torchrl_pref.acquisition.per_second import Cost, PerSecond
 from torchrl_pref.envs.session import is_feed
 from torchrl_pref.errors import check_choice
 from torchrl_pref.strategies.batches import BatchOf
@@ -94,16 +96,25 @@ BATCH_STRATEGIES: dict[str, MakeStrategy] = {
 """Strategies that choose n candidates of an environment with ``batch=n``, by name."""
 
 
-def make_strategy(name: str, env: EnvBase, *beside: str) -> TensorDictModuleBase:
+def make_strategy(
+    name: str, env: EnvBase, *beside: str, cost: Cost | None = None
+) -> TensorDictModuleBase:
     """The strategy of that name in an environment's setup.
 
     Args:
         name: of the setup's table.
         env: says which setup.
         beside: what else the caller knows by name, for the message.
+        cost: how long a question takes, for the strategies that ask by what it is worth for each
+            second; None: as long as :class:`Cost` has it.
 
     Raises:
         InputError: there is none.
     """
     known = FEED_STRATEGIES if is_feed(env) else STRATEGIES
-    return known[check_choice("strategy", name, (*known, *beside))](env)
+    make = known[check_choice("strategy", name, (*known, *beside))]
+    acquisition = ACQUISITIONS.get(name)
+    if cost is None or not isinstance(acquisition, PerSecond):
+        return make(env)
+    acquisition = replace(acquisition, cost=cost)
+    return (QuantileAsk if is_feed(env) else _greedy)(env, acquisition)

@@ -6,8 +6,12 @@ Shapes: N queries, K options per query, D features.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
+from typing import cast
 
+from torchrl_pref.acquisition.per_second import Cost
 from torchrl_pref.beliefs.base import BeliefBase
+from torchrl_pref.config.checks import PER_SECOND
 from torchrl_pref.config.sections import Plain
 from torchrl_pref.errors import InputError
 from torchrl_pref.groups import load_typed, make
@@ -17,7 +21,7 @@ from torchrl_pref.questions.base import Question
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.questions.responses import model_of
 from torchrl_pref.session import Session
-from torchrl_pref.strategies import MakeStrategy
+from torchrl_pref.strategies import MakeStrategy, make_strategy
 from torchrl_pref.tasks.base import Task, feature_bars, make_pool
 from torchrl_pref.tasks.scene import Scene
 
@@ -113,13 +117,21 @@ def make_materials(settings: Plain, raw: QueryPool) -> Materials:
     model = model_of(tau, question, settings["belief"]["lapse"])
     model.n_answers(pool.n_options)  # or it is refused here
     task = None if settings["pool"]["file"] is not None else make("task", settings["task"])
-    named = settings["strategy"]
-    strategy = load_typed("strategy", named) if ":" in named else named
-    made = Materials(settings, raw, pool, normalizer, question, model, strategy, task)
+    made = Materials(settings, raw, pool, normalizer, question, model, _strategy(settings), task)
     if task is not None:
         _try_scene(made)
     made.session(0)  # or it is refused here
     return made
+
+
+def _strategy(settings: Plain) -> str | MakeStrategy:
+    """What chooses the questions: by name, as code of the user's, or with seconds as typed."""
+    named: str = settings["strategy"]
+    if ":" in named:
+        return cast(MakeStrategy, load_typed("strategy", named))
+    if named in PER_SECOND:
+        return partial(make_strategy, named, cost=Cost(**settings["cost"]))
+    return named
 
 
 def _try_scene(materials: Materials) -> None:

@@ -108,7 +108,7 @@ class Study:
         """The settings from which, with the pool and the answers, all follows."""
         settings = self.materials.settings
         checks = {f"study.{name}": settings["study"][name] for name in ("attention", "repeats")}
-        named = ("question", "belief", "setup", "strategy", "tau", "seed")
+        named = ("question", "belief", "setup", "strategy", "cost", "tau", "seed")
         return {**{name: settings[name] for name in named}, **checks}
 
     @contextmanager

@@ -11,7 +11,7 @@ offers left (a quantile rule); *patient* and *eager* multiply that share by .6 a
 The columns are how much more each is than expected alignment alone, in the mean alignment over all
 questions. *Room* is that of the one that is best on every other pool, on the remaining pools; ± is
 twice the standard error, and a room of less than that is none. Pools are of ``task=gaussian``, of
-seeds that no test uses.
+seeds that no test uses. With ``--policies`` trained policies are tried, and no rules.
 """
 
 from __future__ import annotations
@@ -37,6 +37,8 @@ from torchrl_pref.acquisition.functions import alignment_gain, information_gain
 from torchrl_pref.acquisition.scoring import score_queries, standardise, together
 from torchrl_pref.beliefs.rationality import RationalityBelief
 from torchrl_pref.beliefs.sampled import Belief, uniform_sphere
+from torchrl_pref.build import load_policy
+from torchrl_pref.checkpoints.checkpoint import Checkpoint
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.evaluation.run import draw_humans, evaluate
@@ -231,10 +233,18 @@ def model_for(corner: Corner, pool: QueryPool) -> ResponseModel:
     return model_of(tau, QUESTIONS[corner.question](), lapse=0.0)
 
 
-def measure(corner: Corner, setup: str, pools: int, humans: int) -> Found:
+def trained(path: Path) -> Callable[[Any], TensorDictModuleBase]:
+    """The policy of a checkpoint, from an environment."""
+    checkpoint = Checkpoint.load(path)
+    return lambda env: load_policy(checkpoint, env).strategy
+
+
+def measure(corner: Corner, setup: str, pools: int, humans: int, policies: Tried) -> Found:
     """All strategies on all pools, each with the same humans."""
     found = Found()
     tried = tried_in_feeds() if setup == "feed" else tried_in_pools(corner.budget)
+    if policies:
+        tried = {BASELINE: tried[BASELINE], **policies}
     for number in range(pools):
         pool = normalised(corner, number)
         model = model_for(corner, pool)
@@ -252,6 +262,15 @@ def measure(corner: Corner, setup: str, pools: int, humans: int) -> Found:
             done = evaluate(env, make_strategy(env), draw_humans(env))
             found.curves.setdefault(name, []).append(done.alignment[:, 1:])
     return found
+
+
+def row_of_policies(name: str, found: Found) -> common.Row:
+    """What is told of a corner where policies were tried."""
+    row: common.Row = {"corner": name, "alignment": float(torch.cat(found.curves[BASELINE]).mean())}
+    for each in found.curves:
+        if each != BASELINE:
+            row[each] = "{:+.3f} ± {:.3f}".format(*found.more(each))
+    return row
 
 
 def row_of(name: str, setup: str, found: Found) -> common.Row:
@@ -276,6 +295,8 @@ def main() -> None:
     parser.add_argument("--humans", type=int, default=125, help="of each pool (default 125)")
     parser.add_argument("--setup", default="query", choices=list(TRIED), help="(default query)")
     parser.add_argument("--only", help="corners, by semicolons")
+    many = "checkpoints or run folders, to be tried instead of the rules"
+    parser.add_argument("--policies", nargs="+", type=Path, default=[], help=many)
     typed = common.start(parser)
     if typed.pools < 2:
         parser.error("--pools: expected at least 2, to choose on some and to judge on others")
@@ -283,11 +304,11 @@ def main() -> None:
     names = typed.only.split(";") if typed.only else list(corners)
     if unknown := [name for name in names if name not in corners]:
         parser.error(f"--only {unknown[0]}: expected some of {'; '.join(corners)}")
-    rows = []
+    policies, rows = {path.stem: trained(path) for path in typed.policies}, []
     for name in tqdm(names, desc="corners"):
         corner = replace(Corner(), **corners[name])
-        found = measure(corner, typed.setup, typed.pools, typed.humans)
-        rows.append(row_of(name, typed.setup, found))
+        found = measure(corner, typed.setup, typed.pools, typed.humans, policies)
+        rows.append(row_of_policies(name, found) if policies else row_of(name, typed.setup, found))
     title = "Mean alignment over all questions: expected alignment, and what others are more"
     common.report(title, rows, typed.json)
 

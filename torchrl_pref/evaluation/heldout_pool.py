@@ -209,7 +209,8 @@ def try_job(job: Job) -> None:
 
 def _makers(job: Job) -> dict[str, Maker]:
     """What makes the strategies of the user."""
-    return find_makers(job.own, Cost(**job.settings["cost"]))
+    cost = job.settings.get("cost")
+    return find_makers(job.own, None if cost is None else Cost(**cost))
 
 
 def _judged(job: Job, env: QueryEnv | FeedEnv, seed: int, beside: Sequence[str]) -> list[Entrant]:

@@ -32,12 +32,13 @@ from torchrl_pref.strategies import make_strategy
 Maker = Callable[[QueryEnv | FeedEnv], TensorDictModuleBase]
 
 
-def find_makers(typed: Sequence[str], cost: Cost) -> dict[str, Maker]:
+def find_makers(typed: Sequence[str], cost: Cost | None = None) -> dict[str, Maker]:
     """What makes each strategy; for the user's own the current directory is looked in last.
 
     Args:
         typed: a name of the package, or ``module:name``, of each.
-        cost: how long a question takes, for those of the package that count seconds.
+        cost: how long a question takes, for those of the package that count seconds; None: as
+            long as :class:`Cost` has it.
 
     Returns:
         What was found or imported, by the same names.

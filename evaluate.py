@@ -23,6 +23,7 @@ from help_text import CONF
 from torchrl_pref import runs
 from torchrl_pref.config.sections import GroupSection, Plain, Settings
 from torchrl_pref.config.settings import check_evaluate_settings
+from torchrl_pref.config.together import refuse_lookahead
 from torchrl_pref.errors import InputError, one_line_errors
 from torchrl_pref.runs import CHECKPOINT
 
@@ -292,7 +293,6 @@ def evaluate_checkpoints(settings: Settings, paths: list[Path]) -> tuple[Records
     from torchrl_pref.checkpoints.checkpoint import Checkpoint
     from torchrl_pref.evaluation import comparison
     from torchrl_pref.evaluation.records import Records
-    from torchrl_pref.pool import QueryPool
     from torchrl_pref.training.figure import Training
     from torchrl_pref.training.progress import Progress
 
@@ -311,12 +311,14 @@ def evaluate_checkpoints(settings: Settings, paths: list[Path]) -> tuple[Records
     for its_settings, task, _ in groups:
         if settings["pool"]["test"] is not None:
             build.refuse_own_pools(its_settings, build.human_of(its_settings, task))
+        for name in own:
+            refuse_lookahead(its_settings["setup"]["name"], name)
         comparison.try_strategies(own, its_settings, task)
     records, trained = Records(), []
     for its_settings, task, learned in groups:
         test = None
         if settings["pool"]["test"] is not None:
-            test = QueryPool.load(settings["pool"]["test"]).map_features(task.normalizer)
+            test = build.load_test_pool(settings["pool"]["test"], task)
         records.entries += comparison.evaluate_task(its_settings, task, learned, test, own).entries
         for key, checkpoint in learned.items():
             trained.append(Training(key, task.title, Progress.of(checkpoint.training)))

@@ -161,6 +161,10 @@ def test_sweep_makes_one_table(tmp_path: Path) -> None:
     for row in ("optimal human", "noisy human (tau=0.5)", "RL ", "RL-feed"):
         assert row in output
     assert (tmp_path / "all" / "figure_2.png").exists()
+    ahead = "strategy=lookahead", f"hydra.run.dir={tmp_path}/ahead"
+    assert "lookahead" in run("evaluate.py", f"checkpoint={tmp_path}/other/0", *ahead)
+    refused = run_script("evaluate.py", f"checkpoint={tmp_path}/sweep/2", *ahead, folder=ROOT)
+    assert "strategy=lookahead with setup=feed" in refused.stderr
 
 
 @pytest.mark.parametrize("setup", ["query", "feed"])
@@ -416,6 +420,12 @@ BAD_INPUT = [
     ("ask", "-m tau=1,2", "people answer one study at a time"),
     ("evaluate", "setup=query setup.batch=10 strategy=max_regret", "chooses one query at a time"),
     ("evaluate", "strategy=lookahead", "strategy=lookahead with setup=feed"),
+    ("evaluate", "strategy=lookahead protocol=heldout", "which has feeds, too"),
+    (
+        "evaluate",
+        "setup=query pool.train={tmp}/ab.pt pool.test={tmp}/ba.pt",
+        "pool.test has the features b, a, c, d, and the training pool a, b, c, d",
+    ),
     ("evaluate", "strategy=alignment_gain cost.watch=3", "cost.watch: no strategy here counts"),
     ("ask", "cost.decide=3", "cost.decide: no strategy here counts"),
     ("evaluate", "task=gaussian task.dimension=9999", "expected a whole number from 2 to 1000"),
@@ -439,6 +449,8 @@ def test_bad_input_gets_one_line_status_2_and_no_files(
     QueryPool(constant).save(tmp_path / "constant.pt")
     QueryPool(torch.rand(9, 3, 4)).save(tmp_path / "three.pt")
     QueryPool(torch.rand(9, 2, 5)).save(tmp_path / "wide.pt")
+    QueryPool(torch.rand(9, 2, 4), None, tuple("abcd")).save(tmp_path / "ab.pt")
+    QueryPool(torch.rand(9, 2, 4), None, tuple("bacd")).save(tmp_path / "ba.pt")
     before = sorted(tmp_path.rglob("*"))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", [f"{script}.py", *typed.format(tmp=tmp_path).split()])

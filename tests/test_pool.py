@@ -9,7 +9,7 @@ from torch import Generator
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_pref.errors import InputError
-from torchrl_pref.pool import Normalizer, QueryPool, save_atomically
+from torchrl_pref.pool import Normalizer, QueryPool, check_alike, save_atomically
 from torchrl_pref.tasks.gridworld import (
     MOVES,
     Gridworld,
@@ -74,6 +74,29 @@ def test_constant_feature_is_refused() -> None:
         Normalizer.fit(features)
     with pytest.raises(InputError, match="D=2: expected D=3"):
         Normalizer.fit(torch.rand(10, 2, 3))(torch.rand(10, 2, 2))
+
+
+def test_features_of_any_unit_are_normalised() -> None:
+    features = torch.randn(30, 2, 3, dtype=torch.float64) * torch.tensor([5e-7, 1.0, 1e20])
+    flat = Normalizer.fit(features)(features).flatten(0, 1)
+    assert torch.allclose(flat.std(0, correction=0), torch.ones(3, dtype=torch.float64))
+    with pytest.raises(InputError, match="feature 2 varies by less than a millionth of its mean"):
+        Normalizer.fit(torch.rand(30, 2, 2) + torch.tensor([0.0, 1e7]))
+    for bad in (torch.rand(0, 2, 3), torch.tensor(1.0), 1e300 * features):
+        with pytest.raises(InputError, match="features"):
+            Normalizer.fit(bad)
+    with pytest.raises(InputError, match="ndarray"):
+        Normalizer.fit(features)(features.numpy())
+
+
+def test_pools_belong_together_by_number_and_names() -> None:
+    train, names = QueryPool(torch.rand(9, 2, 3), None, ("a", "b", "c")), ("b", "a", "c")
+    check_alike(train, train)
+    check_alike(train, QueryPool(torch.rand(9, 2, 3)))
+    with pytest.raises(InputError, match="the features b, a, c, and the training pool a, b, c"):
+        check_alike(train, QueryPool(torch.rand(9, 2, 3), None, names))
+    with pytest.raises(InputError, match="D=4: expected D=3"):
+        check_alike(train, QueryPool(torch.rand(9, 2, 4)))
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDictBase
@@ -207,7 +208,41 @@ def test_other_kinds_of_question(generator: Generator) -> None:
         session.tell(3)
 
 
-@pytest.mark.parametrize("answer", [2, -1, 0.0, True, "0", [0], torch.tensor(0)])
+@pytest.mark.parametrize("whole", [int, np.int64, torch.tensor])
+def test_whole_numbers_of_any_library_will_do(whole: Any, generator: Generator) -> None:
+    features = torch.randn(50, 2, 3, generator=generator)
+    plain, other = (Session(features, MODEL) for _ in range(2))
+    plain.put(7)
+    other.put(whole(7))
+    plain.tell(1)
+    other.tell(whole(1))
+    assert torch.equal(plain.samples, other.samples)
+    other.put(other.ask().query)
+    both = Session(features, MODEL, people=2)
+    both.put(np.array([3, 4]))
+    assert both.ask().query.tolist() == [3, 4]
+    both.tell(torch.tensor([0, 1]))
+    assert both.n_answered == 1
+
+
+@pytest.mark.parametrize("query", [1.5, None, "3", [1.5], True, 50, -1, [1, 2]])
+def test_what_is_no_query_changes_nothing(query: Any, generator: Generator) -> None:
+    session = Session(torch.randn(50, 2, 3, generator=generator), MODEL)
+    question = session.ask()
+    with pytest.raises(InputError, match="each a whole number from 0 to 49"):
+        session.put(query)
+    assert session.ask().query == question.query
+    feed = Session(torch.randn(50, 2, 3, generator=generator), MODEL, setup="feed", budget=4)
+    with pytest.raises(InputError, match="at most the 20 offers"):
+        feed.put(1, n_offered=21)
+
+
+def test_features_whose_squares_are_infinite_are_no_policy_s() -> None:
+    with pytest.raises(InputError, match="normalise the pool"):
+        Session(1e20 * torch.rand(30, 2, 3), MODEL, "policy")
+
+
+@pytest.mark.parametrize("answer", [2, -1, 0.0, True, "0", [0], torch.tensor(2), np.True_])
 def test_what_is_no_answer_changes_nothing(answer: Any, generator: Generator) -> None:
     session = Session(torch.randn(50, 2, 3, generator=generator), MODEL)
     with pytest.raises(InputError, match=r"expected ask\(\) before tell\(\)"):

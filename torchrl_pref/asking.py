@@ -19,7 +19,8 @@ from torchrl_pref.beliefs.base import BeliefBase
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.envs.transition import SessionState, Tree
-from torchrl_pref.errors import InputError, check_choice, check_type
+from torchrl_pref.errors import InputError, as_whole, check_choice, check_type
+from torchrl_pref.humans.base import REFUSED
 from torchrl_pref.humans.simulated import SimulatedHuman
 from torchrl_pref.pool import QueryPool
 from torchrl_pref.strategies import MakeStrategy, make_strategy
@@ -55,6 +56,11 @@ def make_env(
     nobody = SimulatedHuman(belief.response_model)
     common: dict[str, Any] = {"batch_size": (people,), "seed": seed, "budget": options["budget"]}
     if setup == "query":
+        if options["offers"] is not None:
+            raise InputError(
+                f"offers={options['offers']} with setup='query': queries stream by in a feed "
+                "alone; leave offers out, or set setup='feed'"
+            )
         return QueryEnv(pool, nobody, belief, repeats=options["repeats"], **common)
     return FeedEnv(pool, nobody, belief, offers=options["offers"], skip="free", **common)
 
@@ -189,9 +195,32 @@ def query_indices(env: QueryEnv | FeedEnv, queries: Sequence[int]) -> Tensor:
         InputError: one is not of the pool, or there are not B.
     """
     size, n_queries = env.batch_size.numel(), len(env.features)
-    if len(queries) != size or not all(0 <= query < n_queries for query in queries):
-        raise InputError(f"queries {queries!s:.80}: expected {size} of the {n_queries}")
-    return torch.tensor(queries)
+    given = [as_whole(query) for query in queries]
+    if len(given) != size or not all(type(q) is int and 0 <= q < n_queries for q in given):
+        raise InputError(
+            f"queries {queries!s:.80}: expected {size} of the pool, each a whole number from 0 to "
+            f"{n_queries - 1}"
+        )
+    return torch.tensor(given)
+
+
+def answers_said(env: QueryEnv | FeedEnv, answers: Sequence[Any]) -> Tensor:
+    """(B), answers as the belief is told them; None is one that was refused.
+
+    Raises:
+        InputError: there is no such answer, or there are not B.
+    """
+    size, last = env.batch_size.numel(), env.n_answers - 1
+    if len(answers) != size:
+        raise InputError(f"answers {answers!s:.60}: expected one for each of {size} people")
+    said = [as_whole(one) for one in answers]
+    for one in said:
+        if one is not None and (type(one) is not int or not 0 <= one <= last):
+            raise InputError(
+                f"answer={one!r:.40}: expected a whole number from 0 to {last}, or None where the "
+                "person would not say"
+            )
+    return torch.tensor([REFUSED if one is None else one for one in said])
 
 
 def check_same(content: Mapping[str, Any], made_with: Mapping[str, Any]) -> None:

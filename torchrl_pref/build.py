@@ -25,8 +25,8 @@ from torchrl_pref.groups import make
 from torchrl_pref.humans.base import HumanBase
 from torchrl_pref.humans.demonstrations import Demonstrations
 from torchrl_pref.policies.base import Policy
-from torchrl_pref.pool import Normalizer, QueryPool
-from torchrl_pref.problem import Human, Problem, solve_tau
+from torchrl_pref.pool import Normalizer, QueryPool, check_alike
+from torchrl_pref.problem import Human, Problem, named, solve_tau
 from torchrl_pref.tasks.base import make_pool
 
 ANSWERING = ("tau", "lapse")
@@ -125,6 +125,7 @@ def make_task(
             f"pool.test has K={test.n_options} options a query and pool.train K={train.n_options}: "
             "expected the same K; make both with the same pool.options"
         )
+    check_alike(train, test)
     normalizer = Normalizer.fit(train.features, train.feature_names)
     train, test = train.map_features(normalizer), test.map_features(normalizer)
     solved = solve_tau(tau, train)
@@ -153,6 +154,25 @@ def _kind_of(section: GroupSection) -> str:
         if key not in (*ANSWERING, "name", "make") and value != usual.get(key):
             words.append(f"{key}={value}")
     return " ".join(words)
+
+
+def load_test_pool(path: str, task: Problem) -> QueryPool:
+    """A pool of the user's to test on, normalised as the training pool of a task was.
+
+    Raises:
+        InputError: it cannot be read, or does not belong to the task.
+    """
+    pool = QueryPool.load(path)
+    check_alike(task.train, pool)
+    try:
+        task.response_model.n_answers(pool.n_options)
+    except InputError:
+        raise InputError(
+            f"pool.test={path} has K={pool.n_options} options a query, which the question of the "
+            f"training ({named(task.question)}) cannot be asked about; expected "
+            f"K={task.train.n_options}, as in training"
+        ) from None
+    return pool.map_features(task.normalizer)
 
 
 def reload_task(checkpoint: Checkpoint, train: Path, test: Path) -> Problem:

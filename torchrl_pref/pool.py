@@ -117,6 +117,27 @@ class QueryPool:
             raise InputError(f"{path}: {error}") from None
 
 
+def check_alike(train: QueryPool, test: QueryPool) -> None:
+    """Refuse a test pool that another number of features describes than the training pool, or
+    features of other names; a pool without names may have any.
+
+    Raises:
+        InputError: they do not belong together.
+    """
+    names = train.feature_names, test.feature_names
+    if train.n_features != test.n_features:
+        raise InputError(
+            f"pool.test with D={test.n_features}: expected D={train.n_features} features, as in "
+            "the training pool; use the feature map that the training pool was made with"
+        )
+    if names[0] != names[1] and default_names(train.n_features) not in names:
+        own, other = (", ".join(each)[:200] for each in names)
+        raise InputError(
+            f"pool.test has the features {other}, and the training pool {own}: expected the same, "
+            "in the same order; bring those of pool.test into this order, or save it without names"
+        )
+
+
 def save_atomically(content: dict[str, Any], path: str | Path) -> None:
     """Write plain data and tensors to a file, so that a reader never sees half of it.
 
@@ -184,19 +205,33 @@ class Normalizer:
             names: D, for messages.
 
         Raises:
-            InputError: a feature is no finite number, or never varies, so that no scale makes its
-                variance one.
+            InputError: there are none, one is no finite number, or one never varies, or too little
+                for float32, so that no scale makes its variance one.
         """
-        check_finite("features", check_plain("features", features))
+        check_finite("features", check_plain("features", features).float())
+        if features.ndim < 2 or not features.numel():
+            raise InputError(
+                f"features of shape {tuple(features.shape)}: expected some, with the D features of "
+                "a trajectory last"
+            )
         flat = features.detach().flatten(0, -2).double()
         mean, std = flat.mean(0), flat.std(0, correction=0)
-        constant = (std <= 1e-6 * (1 + mean.abs())).nonzero().squeeze(-1).tolist()
-        if constant:
-            names = names or default_names(len(std))
-            raise InputError(
-                f"{', '.join(names[place] for place in constant)} never varies over the training "
-                "pool: expected features that differ between options; drop it, or use a larger pool"
-            )
+        names = names or default_names(len(std))
+        low, high = flat.aminmax(dim=0)
+        for bad, what, mend in (
+            (low == high, "never varies over the training pool", "drop it, or use a larger pool"),
+            (
+                std.float() <= 1e-6 * mean.abs(),
+                "varies by less than a millionth of its mean over the training pool, which float32 "
+                "hardly tells",
+                "subtract the mean first, or drop it",
+            ),
+        ):
+            if bad.any():
+                which = ", ".join(names[place] for place in bad.nonzero().squeeze(-1).tolist())
+                raise InputError(
+                    f"{which} {what}: expected features that differ between options; {mend}"
+                )
         return cls(mean.float(), std.float())
 
     def save(self, path: str | Path) -> None:
@@ -231,8 +266,9 @@ class Normalizer:
         """Normalise raw features (… D).
 
         Raises:
-            InputError: D is not the number of features that this was fitted on.
+            InputError: they are no tensor, or D is not what this was fitted on.
         """
+        check_plain("features", features)
         if features.shape[-1] != len(self.mean):
             raise InputError(
                 f"features with D={features.shape[-1]}: expected D={len(self.mean)}, as in the "

@@ -17,6 +17,7 @@ from torchrl_pref.acquisition.scoring import mean_answers
 from torchrl_pref.asking import (
     Asked,
     NothingToAsk,
+    answers_said,
     check_same,
     draw_questions,
     make_env,
@@ -29,6 +30,7 @@ from torchrl_pref.beliefs.sampled import Belief
 from torchrl_pref.envs.transition import SessionState, begin, hear, tell
 from torchrl_pref.errors import (
     InputError,
+    as_whole,
     check_count,
     check_flag,
     check_seed,
@@ -194,10 +196,11 @@ class Session(Learned):
         """
         if self._asked is None:
             raise InputError("an answer to no question: expected ask() before tell()")
+        answer = as_whole(answer)
         given = [answer] if self.people is None else answer
         if not isinstance(given, Sequence):
             raise InputError(f"answer={answer!s:.60}: expected a list, one for each person")
-        self._let_in(Turn(self._asked, self._said(given)))
+        self._let_in(Turn(self._asked, answers_said(self._env, given)))
         self._n_gone = self._n_offered
 
     def put(self, query: int | Sequence[int], n_offered: int | None = None) -> None:
@@ -212,10 +215,15 @@ class Session(Learned):
         """
         if self.n_answered >= self.budget:
             raise NothingToAsk(f"budget={self.budget}: all questions are answered")
-        self._asked = query_indices(self._env, [query] if isinstance(query, int) else [*query])
-        self._n_offered = self._n_gone
+        query = as_whole(query)
+        asked = query_indices(self._env, query if isinstance(query, Sequence) else [query])
+        offered = self._n_gone
         if n_offered is not None:
-            self._n_offered = torch.full_like(self._n_gone, check_count("n_offered", n_offered, 0))
+            most = getattr(self._env, "n_offers", 0)
+            if check_count("n_offered", as_whole(n_offered), 0) > most:
+                raise InputError(f"n_offered={n_offered}: expected at most the {most} offers")
+            offered = torch.full_like(self._n_gone, int(n_offered))
+        self._asked, self._n_offered = asked, offered
 
     @property
     def n_offered(self) -> int:
@@ -300,7 +308,8 @@ class Session(Learned):
         )
         check_same(content, session.to_dict())
         for queries, answers in zip(content["queries"], content["answers"], strict=True):
-            said = session._said([None if answer == REFUSED else answer for answer in answers])
+            given_up = [None if answer == REFUSED else answer for answer in answers]
+            said = answers_said(session._env, given_up)
             session._let_in(Turn(query_indices(session._env, queries), said))
         if content["asked"] is not None:
             session._asked = query_indices(session._env, content["asked"])
@@ -322,23 +331,6 @@ class Session(Learned):
     def _luck(self) -> int:
         """The seed of the present turn."""
         return self.seed * PRIME + self.n_answered
-
-    def _said(self, answers: Sequence[Any]) -> Tensor:
-        """(B), answers as the belief is told them.
-
-        Raises:
-            InputError: there is no such answer, or there are not B.
-        """
-        size, last = self._env.batch_size.numel(), self._env.n_answers - 1
-        if len(answers) != size:
-            raise InputError(f"answers {answers!s:.60}: expected one for each of {size} people")
-        for one in answers:
-            if one is not None and (type(one) is not int or not 0 <= one <= last):
-                raise InputError(
-                    f"answer={one!s:.40}: expected a whole number from 0 to {last}, or None where "
-                    "the person would not say"
-                )
-        return torch.tensor([REFUSED if one is None else one for one in answers])
 
     def _let_in(self, turn: Turn) -> None:
         """Add answers to pool queries to the belief."""

@@ -208,6 +208,8 @@ def bomb() -> bytes:
 
 
 BAD: dict[str, tuple[str, Callable[[], bytes | str], str]] = {
+    "csv: no name": (".csv", lambda: "a,\n1,2\n3,4\n", "column 2 has no name"),
+    "csv: 1_000": (".csv", lambda: "a,b\n1,1_000\n3,4\n", "'1_000' in column 'b'"),
     "npz: many empty names": (
         ".npz",
         lambda: npz(features=X, feature_names=np.empty(10**7, "<U0")),

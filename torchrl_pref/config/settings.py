@@ -235,7 +235,13 @@ def check_evaluate_settings(settings: Plain) -> Settings:
     for name in [named] if isinstance(named, str) else named or []:
         if ":" not in name:
             refuse_batches(settings, f"strategy={name}")
-        refuse_lookahead(settings["setup"]["name"], name)
+        if settings["protocol"] is not None and name in ONLY_QUERY:
+            raise InputError(
+                f"strategy={name} with protocol=heldout, which has feeds, too: it looks ahead in a "
+                "pool of questions; name another strategy, or leave protocol= out"
+            )
+        if settings["checkpoint"] is None:  # else the setup is the checkpoint's
+            refuse_lookahead(settings["setup"]["name"], name)
     check_together(settings)
     in_feed = "policy" in settings and settings["setup"]["name"] == "feed"
     if in_feed and settings["skip"] != "free":

@@ -65,7 +65,7 @@ class Demonstrations:
         if len(trajectories) <= self.alternatives:
             raise InputError(
                 f"demonstrations.alternatives={self.alternatives} of {len(trajectories)} "
-                "trajectories in the pool: expected fewer; lower it, or raise pool.size"
+                "trajectories in the pool: expected fewer; lower it, or use a larger pool"
             )
         shape = (len(omega), self.count, self.alternatives + 1)
         index = different(shape, len(trajectories), generator)

@@ -138,6 +138,9 @@ def _csv(path: str, limit: int, choice: Choice) -> Columns:
                 "names, with commas"
             )
         chosen = [name for name in choice.pick(header) if name != choice.texts]
+        if nameless := [name for name in chosen if not name.strip()]:
+            place = header.index(nameless[0]) + 1
+            raise Refused(f"column {place} has no name in the first line; name it, or remove it")
         places = [header.index(name) for name in chosen]
         named_in = None if choice.texts is None else header.index(choice.texts)
         for cells in lines:
@@ -150,7 +153,7 @@ def _csv(path: str, limit: int, choice: Choice) -> Columns:
                 )
             for name, place in zip(chosen, places, strict=True):
                 try:
-                    numbers.append(float(cells[place]))
+                    numbers.append(_number(cells[place]))
                 except ValueError:
                     raise Refused(
                         f"line {lines.line_num} has {cells[place]!r:.40} in column {name!r:.80}; "
@@ -172,10 +175,17 @@ SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars"}
 def is_number(text: str) -> bool:
     """Whether it is a number and no name."""
     try:
-        float(text)
+        _number(text)
     except ValueError:
         return False
     return True
+
+
+def _number(text: str) -> float:
+    """The number that a cell is; Python would read 1_000 as one, too."""
+    if "_" in text:
+        raise ValueError(text)
+    return float(text)
 
 
 def _lines(file: TextIO) -> Iterator[str]:

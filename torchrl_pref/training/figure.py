@@ -9,11 +9,13 @@ import math
 from collections.abc import Iterator, Sequence
 from itertools import cycle, pairwise
 from pathlib import Path
+from textwrap import fill
 from typing import NamedTuple
 
 import torch
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.ticker import LogFormatter
 from torch import Tensor
 
 from torchrl_pref.evaluation.figures import caption, save_figure
@@ -21,6 +23,9 @@ from torchrl_pref.evaluation.statistics import bootstrap_interval
 from torchrl_pref.evaluation.style import Style, kind_of, name_of, styles_of
 from torchrl_pref.evaluation.tables import signed
 from torchrl_pref.training.progress import Progress
+
+LABEL = 60
+"""Letters of a legend's line in Figure 2."""
 
 PANELS = {
     "train/alignment": "alignment in training",
@@ -185,9 +190,11 @@ def figure_2(trained: Sequence[Training], path: Path) -> None:
         name, color, line = styles[training.key]
         points = smoothed(lengths, geometric_edges(len(lengths)))
         (drawn,) = axis.plot(*points, color=color, linestyle=line, marker=marker, markersize=4)
-        drawn.set_label(f"{name}, {training.human}")
+        drawn.set_label(fill(f"{name}, {training.human}", LABEL))
     # Most of it happens in the first hundredth of the updates.
     axis.set(xlabel="policy updates", ylabel="training episode length (offers)", xscale="log")
+    for each in (axis.xaxis.set_major_formatter, axis.xaxis.set_minor_formatter):
+        each(LogFormatter())  # 2 and not 2·10⁰
     axis.grid(alpha=0.25)
     _legend_above(axis)
     caption(

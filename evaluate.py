@@ -21,9 +21,9 @@ import app
 import typed
 from help_text import CONF
 from torchrl_pref import runs
+from torchrl_pref.config.checks import ONLY_QUERY
 from torchrl_pref.config.sections import GroupSection, Plain, Settings
 from torchrl_pref.config.settings import check_evaluate_settings
-from torchrl_pref.config.together import refuse_lookahead
 from torchrl_pref.errors import InputError, one_line_errors
 from torchrl_pref.runs import CHECKPOINT
 
@@ -161,10 +161,9 @@ def own_strategies(settings: Settings) -> dict[str, Maker]:
     """
     if settings["strategy"] is None:
         return {}
-    from torchrl_pref.acquisition.per_second import Cost
     from torchrl_pref.evaluation.own import find_makers
 
-    return find_makers(listed(settings["strategy"]), Cost(**settings["cost"]))
+    return find_makers(listed(settings["strategy"]), settings)
 
 
 def evaluate_taus(
@@ -308,17 +307,20 @@ def evaluate_checkpoints(settings: Settings, paths: list[Path]) -> tuple[Records
         name = str(named.relative_to(common))
         runs.append((name, checkpoint, build.reload_task(checkpoint, *pools)))
     own, groups = own_strategies(settings), comparison.group_checkpoints(runs)
+    named_pool, tests = settings["pool"]["test"], []
     for its_settings, task, _ in groups:
-        if settings["pool"]["test"] is not None:
+        tests.append(None if named_pool is None else build.load_test_pool(named_pool, task))
+        if named_pool is not None:
             build.refuse_own_pools(its_settings, build.human_of(its_settings, task))
-        for name in own:
-            refuse_lookahead(its_settings["setup"]["name"], name)
+        ahead = [name for name in own if name in ONLY_QUERY]
+        if ahead and its_settings["setup"]["name"] == "feed":
+            raise InputError(
+                f"strategy={ahead[0]} beside a policy of a feed: it looks ahead in a pool of "
+                "questions; name runs of setup=query alone, or another strategy"
+            )
         comparison.try_strategies(own, its_settings, task)
     records, trained = Records(), []
-    for its_settings, task, learned in groups:
-        test = None
-        if settings["pool"]["test"] is not None:
-            test = build.load_test_pool(settings["pool"]["test"], task)
+    for (its_settings, task, learned), test in zip(groups, tests, strict=True):
         records.entries += comparison.evaluate_task(its_settings, task, learned, test, own).entries
         for key, checkpoint in learned.items():
             trained.append(Training(key, task.title, Progress.of(checkpoint.training)))

@@ -298,13 +298,13 @@ def main() -> None:
     many = "checkpoints or run folders, to be tried instead of the rules"
     parser.add_argument("--policies", nargs="+", type=Path, default=[], help=many)
     typed = common.start(parser)
-    if typed.pools < 2:
+    if typed.pools < 2 and not typed.policies:
         parser.error("--pools: expected at least 2, to choose on some and to judge on others")
     corners = {**CORNERS, **OF_FEEDS} if typed.setup == "feed" else CORNERS
     names = typed.only.split(";") if typed.only else list(corners)
     if unknown := [name for name in names if name not in corners]:
         parser.error(f"--only {unknown[0]}: expected some of {'; '.join(corners)}")
-    policies, rows = {path.stem: trained(path) for path in typed.policies}, []
+    policies, rows = {str(path): trained(path) for path in typed.policies}, []
     for name in tqdm(names, desc="corners"):
         corner = replace(Corner(), **corners[name])
         found = measure(corner, typed.setup, typed.pools, typed.humans, policies)

@@ -78,6 +78,11 @@ def test_train_evaluate_and_resume(tmp_path: Path) -> None:
     other.save(tmp_path / "other.pt")
     output = run("evaluate.py", f"checkpoint={folder}", "pool.test=other.pt", cwd=tmp_path)
     assert "RL-feed" in output
+    QueryPool(other.features, None, tuple("abcd")).save(tmp_path / "named.pt")
+    QueryPool(other.features[:, :1]).save(tmp_path / "one.pt")
+    for name, words in (("named", "pool.test has the features a, b, c, d"), ("one", "has K=1")):
+        typed = f"checkpoint={folder}", f"pool.test={name}.pt"
+        assert words in run_script("evaluate.py", *typed, folder=tmp_path).stderr
 
     output = run("train.py", f"resume={folder}", "training.updates=5", cwd=tmp_path)
     assert str(folder) in output
@@ -164,7 +169,7 @@ def test_sweep_makes_one_table(tmp_path: Path) -> None:
     ahead = "strategy=lookahead", f"hydra.run.dir={tmp_path}/ahead"
     assert "lookahead" in run("evaluate.py", f"checkpoint={tmp_path}/other/0", *ahead)
     refused = run_script("evaluate.py", f"checkpoint={tmp_path}/sweep/2", *ahead, folder=ROOT)
-    assert "strategy=lookahead with setup=feed" in refused.stderr
+    assert "strategy=lookahead beside a policy of a feed" in refused.stderr
 
 
 @pytest.mark.parametrize("setup", ["query", "feed"])
@@ -420,7 +425,11 @@ BAD_INPUT = [
     ("ask", "-m tau=1,2", "people answer one study at a time"),
     ("evaluate", "setup=query setup.batch=10 strategy=max_regret", "chooses one query at a time"),
     ("evaluate", "strategy=lookahead", "strategy=lookahead with setup=feed"),
-    ("evaluate", "strategy=lookahead protocol=heldout", "which has feeds, too"),
+    (
+        "evaluate",
+        "strategy=lookahead protocol=heldout",
+        "tries no strategy that looks ahead",
+    ),
     (
         "evaluate",
         "setup=query pool.train={tmp}/ab.pt pool.test={tmp}/ba.pt",

@@ -19,11 +19,12 @@ from torchrl_pref.beliefs.base import BeliefBase
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.envs.transition import SessionState, Tree
-from torchrl_pref.errors import InputError, as_whole, check_choice, check_type
+from torchrl_pref.errors import InputError, check_choice, check_type
 from torchrl_pref.humans.base import REFUSED
 from torchrl_pref.humans.simulated import SimulatedHuman
 from torchrl_pref.pool import QueryPool
 from torchrl_pref.strategies import MakeStrategy, make_strategy
+from torchrl_pref.tensors import as_whole
 
 FIRST_BLOCK = 4
 """Offers that are looked at together at first; twice as many each time that none is asked."""

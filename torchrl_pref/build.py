@@ -33,6 +33,10 @@ ANSWERING = ("tau", "lapse")
 """Settings of a human, or of a belief, that are of the response model, and not of their kind."""
 
 
+LARGEST = 1e15
+"""Of a feature that a policy can read."""
+
+
 def make_pools(settings: Settings, test_seed: int | None = None) -> tuple[QueryPool, QueryPool]:
     """Training and test pool, not normalised: of files where they are named, else of the task.
 
@@ -309,7 +313,8 @@ def load_policy(checkpoint: Checkpoint | str | Path, env: EnvBase) -> Policy:
 
     Raises:
         InputError: the file cannot be used, the policy was trained in the other setup or with other
-            skips, or the pool or the weights do not fit.
+            skips, the pool or the weights do not fit, or features are so large that their squares
+            are beyond float32.
     """
     if not isinstance(checkpoint, Checkpoint):
         checkpoint = Checkpoint.load(checkpoint)
@@ -326,6 +331,12 @@ def load_policy(checkpoint: Checkpoint | str | Path, env: EnvBase) -> Policy:
             f"environment with skip={settings['skip']!r}"
         )
     checkpoint.check_fits(QueryPool(env.features))
+    largest = float(env.features.abs().max())
+    if largest > LARGEST:
+        raise InputError(
+            f"features up to {largest:.3g}: expected at most {LARGEST:g}, as a policy reads their "
+            "squares; normalise the pool, by Normalizer.fit"
+        )
     policy = make_policy(checkpoint.settings, env)
     load_weights(policy, checkpoint)
     return policy

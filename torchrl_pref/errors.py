@@ -36,14 +36,6 @@ def check_count(name: str, value: Any, minimum: int) -> int:
     return value
 
 
-def as_whole(value: Any) -> Any:
-    """A whole number of NumPy, torch or Python as Python's own, and arrays of them as lists;
-    anything else as it is."""
-    if hasattr(value, "tolist"):  # of both libraries
-        value = value.tolist()
-    return value
-
-
 def check_batch(batch: int, budget: int) -> int:
     """Return n, how many questions are asked at once, if the budget H is a multiple of it.
 

@@ -205,10 +205,15 @@ class Normalizer:
             names: D, for messages.
 
         Raises:
-            InputError: there are none, one is no finite number, or one never varies, or too little
-                for float32, so that no scale makes its variance one.
+            InputError: there are none, one is no finite number or beyond float32, or one never
+                varies, or too little for float32, so that no scale makes its variance one. What
+                varies by rounding alone is not told from a feature in small units.
         """
-        check_finite("features", check_plain("features", features).float())
+        if not check_plain("features", features).float().isfinite().all():
+            raise InputError(
+                "features: NaN, infinity or a number too large for float32; expected finite numbers"
+                " up to 1e38; mend or scale them"
+            )
         if features.ndim < 2 or not features.numel():
             raise InputError(
                 f"features of shape {tuple(features.shape)}: expected some, with the D features of "
@@ -221,11 +226,12 @@ class Normalizer:
         for bad, what, mend in (
             (low == high, "never varies over the training pool", "drop it, or use a larger pool"),
             (
-                std.float() <= 1e-6 * mean.abs(),
+                std <= 1e-6 * mean.abs(),
                 "varies by less than a millionth of its mean over the training pool, which float32 "
                 "hardly tells",
-                "subtract the mean first, or drop it",
+                "subtract a constant where the feature is made, in float64, or drop it",
             ),
+            (std.float() == 0, "is 0 in float32", "give it in a smaller unit"),
         ):
             if bad.any():
                 which = ", ".join(names[place] for place in bad.nonzero().squeeze(-1).tolist())
@@ -269,10 +275,11 @@ class Normalizer:
             InputError: they are no tensor, or D is not what this was fitted on.
         """
         check_plain("features", features)
-        if features.shape[-1] != len(self.mean):
+        size = features.shape[-1] if features.ndim else 0
+        if size != len(self.mean):
             raise InputError(
-                f"features with D={features.shape[-1]}: expected D={len(self.mean)}, as in the "
-                "training pool; use the feature map that the training pool was made with"
+                f"features with D={size}: expected D={len(self.mean)}, as in the training pool; "
+                "use the feature map that the training pool was made with"
             )
         return (features - self.mean) / self.std
 

@@ -21,9 +21,6 @@ FOLDER = Path(__file__).parent / "policies" / "weights"
 
 SEEDS = 5
 
-LARGEST = 1e15
-"""Of a feature that a policy can read."""
-
 
 def pretrained_checkpoint(setup: str, tau: str | None = None, seed: int = 0) -> Checkpoint:
     """One of the policies that come with the package.
@@ -55,15 +52,8 @@ def pretrained_policy(env: EnvBase, tau: str | None = None, seed: int = 0) -> Po
         seed: of its training, 0 to 4.
 
     Raises:
-        InputError: there is no such policy, the feed's skips are not free, or features are so large
-            that their squares are beyond float32.
+        InputError: there is no such policy, or it cannot decide there (:func:`build.load_policy`).
     """
-    largest = float(env.features.abs().max())
-    if largest > LARGEST:
-        raise InputError(
-            f"features up to {largest:.3g}: expected at most {LARGEST:g}, as the policy reads "
-            "their squares; normalise the pool, by Normalizer.fit"
-        )
     setup = "feed" if is_feed(env) else "query"
     return load_policy(pretrained_checkpoint(setup, tau, seed), env)
 

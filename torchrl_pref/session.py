@@ -30,7 +30,6 @@ from torchrl_pref.beliefs.sampled import Belief
 from torchrl_pref.envs.transition import SessionState, begin, hear, tell
 from torchrl_pref.errors import (
     InputError,
-    as_whole,
     check_count,
     check_flag,
     check_seed,
@@ -44,6 +43,7 @@ from torchrl_pref.questions.prior_evidence import Shown, check_given, given_dige
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.saved_session import EARLIER, FORMAT, check_content
 from torchrl_pref.strategies import MakeStrategy
+from torchrl_pref.tensors import as_whole
 
 PRIME = 1_000_003
 """Between the seeds of two sessions there is room for so many answers."""
@@ -239,6 +239,7 @@ class Session(Learned):
         Raises:
             InputError: there is none.
         """
+        turn = as_whole(turn)
         if type(turn) is not int or not -self.n_answered <= turn < self.n_answered:
             raise InputError(
                 f"nothing to undo: expected the place of one of {self.n_answered} answers, and "

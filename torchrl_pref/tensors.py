@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -30,6 +31,15 @@ def lengths(vectors: Tensor) -> Tensor:
 def directions(vectors: Tensor) -> Tensor:
     """Unit vectors (… D) along vectors (… D): themselves, to the last bit, where they are such."""
     return vectors / lengths(vectors).clamp(min=1e-30)
+
+
+def as_whole(value: Any) -> Any:
+    """Numbers of NumPy and torch as Python's own, and arrays of them as lists; anything else as it
+    is."""
+    known = isinstance(value, (np.ndarray, np.generic)) and not np.ma.isMaskedArray(value)
+    if known or (isinstance(value, Tensor) and not value.is_meta):
+        return value.tolist()
+    return value
 
 
 def check_plain(name: str, tensor: Any) -> Tensor:

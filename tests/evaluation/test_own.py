@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from helpers import make, settings_of, trainer_of
 
 import torchrl_pref
+from torchrl_pref.acquisition import ACQUISITIONS
+from torchrl_pref.acquisition.per_second import Cost, PerSecond
+from torchrl_pref.config.checks import PER_SECOND
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.errors import InputError
@@ -116,6 +121,17 @@ def test_a_strategy_of_the_user_is_a_row_beside_ours(mine: str, setup: str) -> N
     assert torch.equal(with_it[key].alignment[:, 0], without["random"].alignment[:, 0])
     if setup == "feed":  # it asks everything, on the same offers with the same luck
         assert torch.equal(with_it[key].alignment, without["ask_all"].alignment)
+
+
+def test_seconds_that_were_typed_are_those_that_count(pool: QueryPool) -> None:
+    counting = {name for name, each in ACQUISITIONS.items() if isinstance(each, PerSecond)}
+    assert counting == set(PER_SECOND)
+    settings: Any = {"cost": {"watch": 7.0, "decide": 3.0}}
+    env, cost = make(QueryEnv, pool, batch=2), Cost(7.0, 3.0)
+    for name, maker in find_makers(PER_SECOND, settings).items():
+        assert maker(env).acquisition == replace(ACQUISITIONS[name], cost=cost)
+    for name, maker in find_makers(PER_SECOND).items():
+        assert maker(env).acquisition == ACQUISITIONS[name]
 
 
 def test_the_protocol_pairs_several_kinds_and_the_user_s_own(

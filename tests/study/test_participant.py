@@ -12,12 +12,16 @@ from tensordict import TensorDictBase
 from torch import Generator
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from torchrl_pref.acquisition.functions import information_gain
+from torchrl_pref.acquisition.per_second import Cost, PerSecond
 from torchrl_pref.asking import draw_questions, make_env, strategy_of
+from torchrl_pref.beliefs.sampled import Belief
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.envs.transition import begin
 from torchrl_pref.errors import InputError
 from torchrl_pref.groups import make
+from torchrl_pref.humans.simulated import SimulatedHuman
 from torchrl_pref.questions.base import reordered
 from torchrl_pref.session import PRIME
 from torchrl_pref.study.participant import Participant
@@ -378,6 +382,14 @@ def test_nobody_is_asked_twice_in_a_feed(tmp_path: Path) -> None:
         asked = [one.shown.query for one in person.said]
         assert len(set(asked)) == len(asked)
     study.close()
+
+
+def test_a_study_counts_the_seconds_that_were_typed() -> None:
+    made = materials_of("strategy=information_per_second", "cost.watch=7", "cost.decide=3")
+    env = QueryEnv(made.pool, SimulatedHuman(made.response_model), Belief(made.response_model))
+    assert callable(made.strategy)
+    acquisition = made.strategy(env).acquisition
+    assert acquisition == PerSecond(information_gain, Cost(watch=7, decide=3))
 
 
 @pytest.mark.parametrize(

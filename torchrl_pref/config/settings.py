@@ -237,8 +237,8 @@ def check_evaluate_settings(settings: Plain) -> Settings:
             refuse_batches(settings, f"strategy={name}")
         if settings["protocol"] is not None and name in ONLY_QUERY:
             raise InputError(
-                f"strategy={name} with protocol=heldout, which has feeds, too: it looks ahead in a "
-                "pool of questions; name another strategy, or leave protocol= out"
+                f"strategy={name}: the protocol tries no strategy that looks ahead; name another, "
+                "or leave protocol= out"
             )
         if settings["checkpoint"] is None:  # else the setup is the checkpoint's
             refuse_lookahead(settings["setup"]["name"], name)

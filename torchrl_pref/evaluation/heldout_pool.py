@@ -16,7 +16,6 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_pref.acquisition.functions import alignment_gain, information_gain, volume_removal
-from torchrl_pref.acquisition.per_second import Cost
 from torchrl_pref.build import (
     load_policy,
     make_feed_env,
@@ -31,7 +30,7 @@ from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.envs.session import is_feed
 from torchrl_pref.evaluation.comparison import FIRST_EVALUATION_SEED
 from torchrl_pref.evaluation.metrics import make_exam
-from torchrl_pref.evaluation.own import Maker, find_makers, make_own, try_own
+from torchrl_pref.evaluation.own import find_makers, make_own, try_own
 from torchrl_pref.evaluation.records import Entry, entry_of
 from torchrl_pref.evaluation.run import draw_humans
 from torchrl_pref.evaluation.side_by_side import Entrant, run_side_by_side
@@ -204,13 +203,7 @@ def try_job(job: Job) -> None:
     env = _make_env(job, task, pool, 0, 2)
     for one in (one for checkpoints in job.learned.values() for one in checkpoints):
         load_policy(one, env)
-    try_own(_makers(job), env)
-
-
-def _makers(job: Job) -> dict[str, Maker]:
-    """What makes the strategies of the user."""
-    cost = job.settings.get("cost")
-    return find_makers(job.own, None if cost is None else Cost(**cost))
+    try_own(find_makers(job.own, job.settings), env)
 
 
 def _judged(job: Job, env: QueryEnv | FeedEnv, seed: int, beside: Sequence[str]) -> list[Entrant]:
@@ -220,7 +213,7 @@ def _judged(job: Job, env: QueryEnv | FeedEnv, seed: int, beside: Sequence[str])
         for key, checkpoints in job.learned.items()
         for one in checkpoints
     ]
-    return [*policies, *make_own(_makers(job), env, seed, beside)]
+    return [*policies, *make_own(find_makers(job.own, job.settings), env, seed, beside)]
 
 
 def _lineup(job: Job, task: Problem, env: QueryEnv | FeedEnv, seed: int) -> list[Entrant]:

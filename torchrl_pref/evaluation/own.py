@@ -20,6 +20,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_pref.acquisition.per_second import Cost
+from torchrl_pref.config.sections import Settings
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.envs.session import is_feed
@@ -32,13 +33,13 @@ from torchrl_pref.strategies import make_strategy
 Maker = Callable[[QueryEnv | FeedEnv], TensorDictModuleBase]
 
 
-def find_makers(typed: Sequence[str], cost: Cost | None = None) -> dict[str, Maker]:
+def find_makers(typed: Sequence[str], settings: Settings | None = None) -> dict[str, Maker]:
     """What makes each strategy; for the user's own the current directory is looked in last.
 
     Args:
         typed: a name of the package, or ``module:name``, of each.
-        cost: how long a question takes, for those of the package that count seconds; None: as
-            long as :class:`Cost` has it.
+        settings: the section ``cost``, for those of the package that count seconds; without it a
+            question takes as long as :class:`Cost` has it.
 
     Returns:
         What was found or imported, by the same names.
@@ -46,6 +47,8 @@ def find_makers(typed: Sequence[str], cost: Cost | None = None) -> dict[str, Mak
     Raises:
         InputError: there is no such module or name, or it cannot be called.
     """
+    section = None if settings is None else settings.get("cost")
+    cost = None if section is None else Cost(**section)
     return {
         name: load(f"strategy={name}", name)
         if ":" in name

@@ -237,6 +237,18 @@ def test_what_is_no_query_changes_nothing(query: Any, generator: Generator) -> N
         feed.put(1, n_offered=21)
 
 
+def test_nothing_of_a_session_is_in_the_hands_of_others(generator: Generator) -> None:
+    features = torch.randn(50, 2, 3, generator=generator)
+    state = torch.get_rng_state()
+    session = Session(features, MODEL, "policy")
+    session.ask()
+    session.tell(0)
+    assert torch.equal(torch.get_rng_state(), state)
+    kept = session.samples
+    session.samples.zero_()
+    assert torch.equal(session.samples, kept)
+
+
 def test_features_whose_squares_are_infinite_are_no_policy_s() -> None:
     with pytest.raises(InputError, match="normalise the pool"):
         Session(1e20 * torch.rand(30, 2, 3), MODEL, "policy")
@@ -264,6 +276,11 @@ def test_what_is_no_answer_changes_nothing(answer: Any, generator: Generator) ->
         {"queries": [[1], [99]]},
         {"queries": [[1, 2], [3, 4]]},
         {"queries": "import os"},
+        {"gone": []},
+        {"offered": [1, 2]},
+        {"offered": [-1]},
+        {"people": 2**70},
+        {"budget": 10**8},
         {"seed": "0"},
         {"budget": 1},
         {"pool": "0" * 64},

@@ -337,6 +337,7 @@ def load_policy(checkpoint: Checkpoint | str | Path, env: EnvBase) -> Policy:
             f"features up to {largest:.3g}: expected at most {LARGEST:g}, as a policy reads their "
             "squares; normalise the pool, by Normalizer.fit"
         )
-    policy = make_policy(checkpoint.settings, env)
+    with torch.random.fork_rng(devices=[]):  # the weights it begins with are not kept
+        policy = make_policy(checkpoint.settings, env)
     load_weights(policy, checkpoint)
     return policy

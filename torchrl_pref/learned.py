@@ -71,8 +71,8 @@ class Learned:
 
     @property
     def samples(self) -> Tensor:
-        """(B M D), the belief's."""
-        return self._plain(self._states[-1]["samples"])
+        """(B M D), a copy of the belief's."""
+        return self._plain(self._states[-1]["samples"]).clone()
 
     @property
     def weights(self) -> Weights:

@@ -13,6 +13,10 @@ EARLIER = {"given": None, "setup": "query", "offers": None, "offered": None, "go
 """What sessions of earlier versions do not say of themselves."""
 
 
+LARGEST = {"people": 10**5, "budget": 10**5, "offers": 10**7}
+"""What a saved session can say of its sizes: nobody's memory is taken by a number in a file."""
+
+
 def check_content(content: Any) -> None:
     """Refuse what ``Session.to_dict`` did not make.
 
@@ -26,6 +30,14 @@ def check_content(content: Any) -> None:
     def turns(rows: Any) -> bool:
         return isinstance(rows, list) and all(map(numbers, rows))
 
+    def size(key: str) -> bool:
+        return type(content[key]) is int and 1 <= content[key] <= LARGEST[key]
+
+    def gone_by(counts: Any) -> bool:
+        """Of a feed, for each of the people; of a pool none."""
+        most, people = content["offers"] or 0, content["people"] or 1
+        return numbers(counts) and len(counts) == people and 0 <= min(counts) <= max(counts) <= most
+
     checks = {
         "format": lambda value: value == FORMAT,
         "pool": lambda value: isinstance(value, str),
@@ -33,17 +45,17 @@ def check_content(content: Any) -> None:
         "belief": lambda value: isinstance(value, str),
         "strategy": lambda value: isinstance(value, str),
         "repeats": lambda value: type(value) is bool,
-        "budget": lambda value: type(value) is int,
-        "people": lambda value: value is None or type(value) is int,
+        "budget": lambda value: size("budget"),
+        "people": lambda value: value is None or size("people"),
         "seed": lambda value: type(value) is int,
         "queries": turns,
         "answers": turns,
         "given": lambda value: value is None or isinstance(value, str),
         "asked": lambda value: value is None or numbers(value),
         "setup": lambda value: value in ("query", "feed"),
-        "offers": lambda value: value is None or type(value) is int,
-        "offered": lambda value: value is None or numbers(value),
-        "gone": lambda value: value is None or numbers(value),
+        "offers": lambda value: value is None or size("offers"),
+        "offered": lambda value: value is None or gone_by(value),
+        "gone": lambda value: value is None or gone_by(value),
     }
     if not isinstance(content, dict):
         raise InputError(f"a session of type {type(content).__name__}: expected a dict")

@@ -5,6 +5,7 @@ The lines of docs/torchrl.md are here, each run.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from typing import Any
 
@@ -433,3 +434,13 @@ def test_discrete_sac_needs_a_finite_number_for_what_is_masked(pool: QueryPool) 
     (found["loss_actor"] + found["loss_qvalue"]).backward()
     assert all(weight.grad.isfinite().all() for weight in logits.parameters())
     assert losses()["loss_actor"].isnan()  # TorchRL's own limit: 0 times minus infinity
+
+
+@pytest.mark.parametrize("batch", [1, 2])
+def test_no_transform_can_write_into_the_pool(batch: int, pool: QueryPool) -> None:
+    env, before = make(QueryEnv, pool, batch=batch), pool.features.clone()
+    queries = env.reset()["queries"]
+    with contextlib.suppress(RuntimeError):  # where torch sees that it is one pool for all
+        queries.mul_(3)
+    assert torch.equal(pool.features, before)
+    assert torch.equal(env.features, before)

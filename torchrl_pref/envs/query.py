@@ -119,9 +119,11 @@ class QueryEnv(SessionEnv):
     def _shown(self, session: SessionState, hidden: Tree) -> dict[str, Tensor]:
         shown, size = super()._shown(session, hidden), len(session["n_asked"])
         if self._shows_all:
-            # A view: the whole pool is the same for every session.
+            # A view: the whole pool is the same for every session. Torch lets nobody write into
+            # it, but where there is one session: that gets a copy.
             candidates = torch.arange(len(self.features), device=self.device).expand(size, -1)
-            shown["queries"] = self.features.expand(size, *self.features.shape)
+            queries = self.features.expand(size, *self.features.shape)
+            shown["queries"] = queries.clone() if size == 1 else queries
         else:
             candidates = hidden["candidates"]
             shown["queries"] = self.features[candidates]
@@ -157,6 +159,7 @@ class QueryEnv(SessionEnv):
         again = before.any(-1, keepdim=True)
         if (again & (session["n_asked"] < self.budget)).any():
             raise InputError(
-                "action: a query that was asked before, where repeats=False; expected one that "
-                "action_mask allows; mask the policy, or make the environment with repeats=True"
+                "action: a query that was asked before, or twice in one action, where "
+                "repeats=False; expected others, which action_mask allows; mask the policy, or "
+                "make the environment with repeats=True"
             )

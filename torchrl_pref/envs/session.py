@@ -6,7 +6,7 @@ per query, D features, H query budget, O offers.
 A session is one human, from the prior to H answers. An environment is the transition of
 ``envs.transition`` plus where the questions come from and what is rewarded; a step on a finished
 session changes nothing and is worth nothing. All of a session's state is in the tensordict, so
-partial resets, collectors and replay work and one environment serves any batch:
+partial resets, collectors and replay work:
 
 ====================================  ===========================================================
 *shown*: observations, for a policy

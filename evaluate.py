@@ -309,9 +309,11 @@ def evaluate_checkpoints(settings: Settings, paths: list[Path]) -> tuple[Records
     own, groups = own_strategies(settings), comparison.group_checkpoints(runs)
     named_pool, tests = settings["pool"]["test"], []
     for its_settings, task, _ in groups:
-        tests.append(None if named_pool is None else build.load_test_pool(named_pool, task))
+        test = None
         if named_pool is not None:
             build.refuse_own_pools(its_settings, build.human_of(its_settings, task))
+            test = build.load_test_pool(named_pool, task)
+        tests.append(test)
         ahead = [name for name in own if name in ONLY_QUERY]
         if ahead and its_settings["setup"]["name"] == "feed":
             raise InputError(

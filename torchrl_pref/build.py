@@ -32,7 +32,6 @@ from torchrl_pref.tasks.base import make_pool
 ANSWERING = ("tau", "lapse")
 """Settings of a human, or of a belief, that are of the response model, and not of their kind."""
 
-
 LARGEST = 1e15
 """Of a feature that a policy can read."""
 

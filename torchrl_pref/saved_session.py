@@ -12,7 +12,6 @@ FORMAT = 1
 EARLIER = {"given": None, "setup": "query", "offers": None, "offered": None, "gone": None}
 """What sessions of earlier versions do not say of themselves."""
 
-
 LARGEST = {"people": 10**5, "budget": 10**5, "offers": 10**7}
 """What a saved session can say of its sizes: nobody's memory is taken by a number in a file."""
 

@@ -196,8 +196,7 @@ class Session(Learned):
         """
         if self._asked is None:
             raise InputError("an answer to no question: expected ask() before tell()")
-        answer = as_whole(answer)
-        given = [answer] if self.people is None else answer
+        given = [answer] if self.people is None else as_whole(answer)
         if not isinstance(given, Sequence):
             raise InputError(f"answer={answer!s:.60}: expected a list, one for each person")
         self._let_in(Turn(self._asked, answers_said(self._env, given)))
@@ -220,9 +219,10 @@ class Session(Learned):
         offered = self._n_gone
         if n_offered is not None:
             most = getattr(self._env, "n_offers", 0)
-            if check_count("n_offered", as_whole(n_offered), 0) > most:
-                raise InputError(f"n_offered={n_offered}: expected at most the {most} offers")
-            offered = torch.full_like(self._n_gone, int(n_offered))
+            count = check_count("n_offered", as_whole(n_offered), 0)
+            if count > most:
+                raise InputError(f"n_offered={count}: expected at most the {most} offers")
+            offered = torch.full_like(self._n_gone, count)
         self._asked, self._n_offered = asked, offered
 
     @property

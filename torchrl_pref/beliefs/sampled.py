@@ -136,7 +136,7 @@ class Belief(BeliefBase):
         limit = math.inf if samples.shape[2] == CIRCLE else SURPRISE
         anew = foreseen.exp().mean(1) < limit
         if anew.any():
-            indeed = self._surprised(samples[anew], answers[anew], limit)
+            indeed = self._surprised(samples[anew], answers[anew], foreseen[anew].exp(), limit)
             anew = anew.masked_scatter(anew, indeed)
         few = ~anew & (kish_share(foreseen) < MIN_SHARE)
         inflation = self.n_samples / ess
@@ -164,11 +164,12 @@ class Belief(BeliefBase):
         model = self.response_model
         return (model.answer_log_likelihood if one else model.joint_log_likelihood)(gaps, floor)
 
-    def _surprised(self, samples: Tensor, answers: Evidence, limit: float) -> Tensor:
-        """(S), whether samples (S M D) gave the last of answers (S H) less than this share of what
-        it could have, and it is no answer that could be impossible."""
+    def _surprised(
+        self, samples: Tensor, answers: Evidence, foreseen: Tensor, limit: float
+    ) -> Tensor:
+        """(S), whether samples (S M D) gave the last of answers (S H), which they foresaw so likely
+        (S M), less than this share of what it could have, and no answer is impossible."""
         newest = answers[:, -1]
-        foreseen = self._likelihood(samples, newest).exp()
         # The most that any ω would give it, or nearly: that of the sample or the mean row.
         ahead = F.normalize(newest.rows.sum((1, 2)), dim=-1).unsqueeze(1)
         most = torch.cat([foreseen, self._likelihood(ahead, newest).exp()], 1).amax(1)

@@ -30,7 +30,7 @@ FILE = Path(__file__).with_suffix(".json")
 CELLS = [(setup, tau) for setup in ("query", "feed") for tau in ("noisy", "optimal")]
 
 SMALL = ["pool.size=150", "setup.budget=6", "evaluation.humans=40"]
-SHORT = ["training.updates=6", "training.sessions=12", "training.warm_up=1"]
+SHORT = ["training.updates=6", "training.sessions=12", "training.warm_up=1", "training.stages=1"]
 
 WRITTEN_AS = {
     "greedy_information": "greedy",

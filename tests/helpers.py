@@ -90,6 +90,7 @@ def settings_of(setup: str = "feed", policy: str = "scorer", **training: Any) ->
             "sessions": 4,
             # Not a divisor of the episode, so that batches end in mid-session.
             "steps": 3,
+            "stages": 4,
             "optimizer": "rmsprop",
             "learning_rate": 0.01,
             "gamma": 0.99,

@@ -90,7 +90,13 @@ def test_each_pass_takes_a_step_on_each_part(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_ppo_learns_what_the_feed_rewards(tmp_path: Path) -> None:
     """As A2C does, in a third of the updates: asking pays, and the episodes get shorter."""
-    constants = {"sessions": 32, "steps": 8, "optimizer": "adam", "learning_rate": 0.01}
+    constants = {
+        "sessions": 32,
+        "steps": 8,
+        "stages": 1,
+        "optimizer": "adam",
+        "learning_rate": 0.01,
+    }
     settings = ppo_settings(policy="paper", updates=20, epochs=4, **constants)
     settings |= {"objective": "information_gain", "skip": "regret"}
     trainer, _ = trainer_of(settings)
@@ -109,8 +115,8 @@ def test_what_is_told_of_an_update(setup: str, algorithm: str, tmp_path: Path) -
     batches: list[TensorDictBase] = []
     collect = trainer.sessions.collect
 
-    def note() -> Any:
-        batches.append(collect())
+    def note(number: int) -> Any:
+        batches.append(collect(number))
         return batches[-1]
 
     trainer.sessions.collect = note  # type: ignore[method-assign]

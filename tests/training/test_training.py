@@ -52,7 +52,13 @@ def test_resumed_run_equals_an_uninterrupted_one_bit_for_bit(
 
 def test_a2c_learns_what_the_feed_rewards(tmp_path: Path) -> None:
     """With the paper's ±r reward, asking pays: the episodes get shorter (the paper's Figure 2)."""
-    constants = {"sessions": 32, "steps": 8, "optimizer": "adam", "learning_rate": 0.01}
+    constants = {
+        "sessions": 32,
+        "steps": 8,
+        "stages": 1,
+        "optimizer": "adam",
+        "learning_rate": 0.01,
+    }
     settings = settings_of(policy="paper", updates=60, **constants)
     settings |= {"objective": "information_gain", "skip": "regret"}
     trainer, _ = trainer_of(settings)
@@ -122,7 +128,13 @@ def test_critic_steps_bring_the_critic_to_the_returns() -> None:
     """Without them it still forecasts far too little when the policy begins to learn from it."""
     errors = []
     for critic_steps in (0, 20):
-        constants = {"sessions": 32, "steps": None, "optimizer": "adam", "learning_rate": 0.001}
+        constants = {
+            "sessions": 32,
+            "steps": None,
+            "stages": 1,
+            "optimizer": "adam",
+            "learning_rate": 0.001,
+        }
         settings = settings_of("query", critic_steps=critic_steps, warm_up=20, **constants)
         trainer, _ = trainer_of(settings)
         for _ in range(12):
@@ -139,10 +151,37 @@ def test_critic_steps_bring_the_critic_to_the_returns() -> None:
 
 @pytest.mark.parametrize("setup", ["query", "feed"])
 def test_a_batch_has_the_steps_a_session_may_take(setup: str) -> None:
-    trainer, _ = trainer_of(settings_of(setup, steps=None))
+    trainer, _ = trainer_of(settings_of(setup, steps=None, stages=1))
     batch = trainer.sessions.collect()
     assert batch.shape == (4, 4 if setup == "query" else 20)
     assert batch["next", "done"].any(1).all()
+
+
+@pytest.mark.parametrize("setup", ["query", "feed"])
+def test_sessions_are_at_as_many_stages_as_a_batch_is_short(setup: str) -> None:
+    trainer, _ = trainer_of(settings_of(setup, steps=None, stages=4))
+    strategy = trainer.sessions.strategy
+
+    def skip(session: Any) -> Any:
+        """A session of a feed then takes as many steps as it has offers."""
+        return strategy(session).set("action", torch.zeros(4, dtype=torch.long))
+
+    trainer.sessions.strategy = skip
+    whole = 4 if setup == "query" else 20
+    batches = [trainer.sessions.collect(number) for number in range(8)]
+    assert all(batch.shape == (4, whole // 4) for batch in batches)
+    later = {key: torch.cat([b["next", key] for b in batches], 1) for key in ("step_count", "done")}
+    steps = torch.arange(2 * whole)
+    for row, counts in enumerate(later["step_count"].squeeze(-1)):
+        begun = steps - row * whole // 4  # since its session began again
+        assert torch.equal(counts, torch.where(begun < 0, steps, begun % whole) + 1)
+        assert torch.equal(later["done"][row].squeeze(-1), (begun >= 0) & (counts == whole))
+    rewards = torch.cat([batch["next", "reward"] for batch in batches], 1)
+    totals = torch.cat([batch["next", "episode_reward"] for batch in batches], 1)
+    for count in range(1, whole + 1):  # what a session has had, from its first step on
+        for row, end in (later["step_count"].squeeze(-1) == count).nonzero():
+            own = rewards[row, end + 1 - count : end + 1].sum()
+            assert torch.allclose(totals[row, end].squeeze(), own, atol=1e-5)
 
 
 def test_explained_variance_is_the_critics_share_of_the_returns() -> None:

@@ -103,7 +103,8 @@ def parts_of(settings: Settings, *pool_shape: int) -> Iterator[Part]:
     budget, offers = setup["budget"], _offers(settings)
     beliefs = ("belief.samples", "setup.budget")
     if "training" in settings:
-        steps = settings["training"]["steps"] or offers or budget
+        whole = -(-(offers or budget) // settings["training"]["stages"])
+        steps = settings["training"]["steps"] or whole
         frames = settings["training"]["sessions"] * steps
         kept = 36.0 * samples * n_features
         n_answers, _, _ = sizes_of(settings, n_options)
@@ -111,7 +112,7 @@ def parts_of(settings: Settings, *pool_shape: int) -> Iterator[Part]:
         kept += 20.0 * _rows_shown(settings) * (n_features + 1)
         kept += _shown(settings, n_queries, n_options, n_features)
         own = "setup.offers" if setup["name"] == "feed" else "setup.candidates"
-        keys = ("training.sessions", "training.steps", *beliefs, *sizes, own)
+        keys = ("training.sessions", "training.steps", "training.stages", *beliefs, *sizes, own)
         yield Part("training", frames * kept, keys)
     humans = settings["evaluation"]["humans"]
     if settings.get("protocol") is not None:

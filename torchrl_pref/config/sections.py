@@ -74,6 +74,7 @@ class TrainingSection(TypedDict):
     updates: int
     sessions: int
     steps: int | None
+    stages: int
     optimizer: str
     learning_rate: float
     gamma: float

@@ -88,6 +88,7 @@ TRAINING: dict[str, Check] = {
     "training.updates": count(1),
     "training.sessions": count(1),
     "training.steps": optional(count(1)),
+    "training.stages": count(1),
     "training.optimizer": choice("adam", "rmsprop"),
     "training.learning_rate": positive(1.0),
     "training.gamma": check_share,

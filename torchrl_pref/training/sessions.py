@@ -29,14 +29,19 @@ class Sessions:
         env: its batch size is B.
         policy: who asks.
         steps: T.
+        stages: how many, T steps apart, the sessions are to be at in each batch but the first few,
+            so that a batch of less than whole sessions is not about their beginning alone, or
+            their end.
 
     Attributes:
         now: the sessions as they stand, with the reward (``episode_reward``) and the number of
             steps (``step_count``) that each has had.
     """
 
-    def __init__(self, env: QueryEnv | FeedEnv, policy: Policy, steps: int) -> None:
-        self.env, self.policy, self.steps = env, policy, steps
+    def __init__(
+        self, env: QueryEnv | FeedEnv, policy: Policy, steps: int, stages: int = 1
+    ) -> None:
+        self.env, self.policy, self.steps, self.stages = env, policy, steps, stages
         self.strategy = policy.strategy
         self.kept = {*policy.actor.in_keys, *policy.value.in_keys, "logits", "action", "n_asked"}
         self.now: TensorDictBase = env.reset()
@@ -69,12 +74,18 @@ class Sessions:
         restore_sessions(self.now, state, session, *sizes)
 
     @torch.no_grad()
-    def collect(self) -> TensorDict:
+    def collect(self, number: int = 0) -> TensorDict:
         """The next T steps (B T), with the values that the critic gives to each state and the next.
+
+        Args:
+            number: how many batches came before. In each of the first, one in ``stages`` of the
+                sessions begins again.
 
         A batch holds under ``next``: reward and done flags, ``n_asked``, the alignment where a
         session ended (else NaN), and the ``episode_reward`` and ``step_count`` with the step.
         """
+        if 0 < number < self.stages:
+            self._begin_again(torch.arange(self.now.numel()) % self.stages == number)
         records, cut_off = [], []
         with set_exploration_type(ExplorationType.RANDOM):
             for t in range(self.steps):
@@ -92,6 +103,14 @@ class Sessions:
             later[cut, t] = value
         batch["next", "state_value"] = later
         return batch
+
+    def _begin_again(self, chosen: Tensor) -> None:
+        """Put those of the sessions (B) that are chosen at their start."""
+        chosen = chosen.unsqueeze(-1).to(self.now.device)
+        for flag in ("done", "terminated"):
+            self.now[flag] = self.now[flag] | chosen
+        counts = {key: self.now[key] * ~chosen for key in ("episode_reward", "step_count")}
+        self.now = self.env.maybe_reset(self.now).update(counts)
 
     def _step(self) -> tuple[TensorDict, TensorDictBase]:
         """One step of all sessions: what is kept of it, and the state after it."""

@@ -14,7 +14,9 @@ class TrainingSettings:
     Attributes:
         updates: batches that are learned from, each of the sessions' next steps.
         sessions: B, humans questioned side by side.
-        steps: T, steps of each session between two updates; None: as many as a session may take.
+        steps: T, steps of each session between two updates; None: as many as a session may take,
+            over ``stages``.
+        stages: how many, T steps apart, the sessions of a batch are at.
         optimizer: ``adam`` or ``rmsprop``.
         learning_rate: of the optimizer.
         gamma: discount of the reward for each step; where skips are free, for each question.
@@ -51,11 +53,12 @@ class TrainingSettings:
     warm_up: int
     average: float
     save_every: int
+    stages: int = 1
     problems: str = "one"
 
     def __post_init__(self) -> None:
         check_choice("training.problems", self.problems, ("one", "drawn"))
-        for name in ("updates", "sessions", "save_every"):
+        for name in ("updates", "sessions", "stages", "save_every"):
             check_count(f"training.{name}", getattr(self, name), 1)
         if self.steps is not None:
             check_count("training.steps", self.steps, 1)

@@ -33,7 +33,8 @@ def make_trainer(settings: Settings, task: Problem) -> Trainer:
     algorithm = learn(policy, constants, **own)
     if constants.problems == "drawn":
         return Trainer(DrawnSessions(settings, policy, env, seed), algorithm, seed)
-    sessions = Sessions(env, policy, constants.steps or env.max_steps)
+    stages = constants.stages
+    sessions = Sessions(env, policy, constants.steps or -(-env.max_steps // stages), stages)
     return Trainer(sessions, algorithm, seed)
 
 

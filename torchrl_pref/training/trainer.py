@@ -112,7 +112,7 @@ class Trainer:
     def _advance(self) -> None:
         """Ask, learn, and note in the progress how it went."""
         start = time.perf_counter()
-        batch = self.sessions.collect()
+        batch = self.sessions.collect(self.progress.update)
         learned = self.update(batch)
         self.progress.update += 1
         metrics = {f"train/{name}": value for name, value in learned.items()}

@@ -113,6 +113,15 @@ def test_shapes_that_do_not_fit_are_refused(shape: tuple[int, ...]) -> None:
         QueryPool(torch.rand(shape))
 
 
+def test_another_default_type_is_refused_before_anything_is_asked() -> None:
+    torch.set_default_dtype(torch.float64)
+    try:
+        with pytest.raises(InputError, match=r"torch\.float64: expected torch\.float32"):
+            QueryPool(torch.rand(5, 2, 3))
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
 def test_trajectories_must_belong_to_the_features() -> None:
     with pytest.raises(InputError, match="trajectories of shape"):
         QueryPool(torch.rand(10, 2, 3), torch.rand(9, 2, 5))

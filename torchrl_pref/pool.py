@@ -17,7 +17,13 @@ from torch import Tensor
 from torchrl_pref.errors import InputError
 from torchrl_pref.storage.files import DTYPES, is_dense, load_safely, without_rest
 from torchrl_pref.storage.writing import replacing
-from torchrl_pref.tensors import check_finite, check_names, check_plain, default_names
+from torchrl_pref.tensors import (
+    check_default_dtype,
+    check_finite,
+    check_names,
+    check_plain,
+    default_names,
+)
 
 
 @dataclass(frozen=True)
@@ -39,6 +45,7 @@ class QueryPool:
     feature_names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        check_default_dtype()
         object.__setattr__(self, "features", check_features(self.features))
         names = self.feature_names or default_names(self.n_features)
         object.__setattr__(self, "feature_names", check_names(names, self.n_features))

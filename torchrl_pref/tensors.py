@@ -105,6 +105,19 @@ def check_range(name: str, values: Any, low: int, high: int, meaning: str) -> Te
     return values.long()
 
 
+def check_default_dtype() -> None:
+    """Refuse to begin where torch makes tensors of another type than this package computes in.
+
+    Raises:
+        InputError: torch's default is not ``float32``.
+    """
+    if torch.get_default_dtype() != torch.float32:
+        raise InputError(
+            f"torch's default type is {torch.get_default_dtype()}: expected torch.float32, in which "
+            "beliefs, humans and policies are kept; call torch.set_default_dtype(torch.float32)"
+        )
+
+
 def check_shape(name: str, tensor: Tensor, expected: tuple[int, ...], meaning: str) -> None:
     """Refuse a tensor of another shape.
 

@@ -113,8 +113,8 @@ def check_default_dtype() -> None:
     """
     if torch.get_default_dtype() != torch.float32:
         raise InputError(
-            f"torch's default type is {torch.get_default_dtype()}: expected torch.float32, in which "
-            "beliefs, humans and policies are kept; call torch.set_default_dtype(torch.float32)"
+            f"torch's default type is {torch.get_default_dtype()}: expected torch.float32, that of "
+            "beliefs, humans and policies; call torch.set_default_dtype(torch.float32)"
         )
 
 

@@ -16,12 +16,6 @@ from torchrl_pref.tasks.gridworld import gridworld_pool
 
 torch.set_num_threads(1)
 
-
-def pytest_xdist_auto_num_workers() -> int:
-    """One process more than there are cores: some tests wait, for a browser or another process."""
-    return (os.cpu_count() or 1) + 1
-
-
 RESPONSE_MODELS = [Boltzmann(4.4), Optimal()]
 
 

@@ -1,5 +1,6 @@
 """The machine code of compiled functions is kept where it can be; loops in threads."""
 
+import hashlib
 import os
 import signal
 import subprocess
@@ -13,9 +14,12 @@ import pytest
 import torch
 from numba import config
 
+import torchrl_pref.beliefs.elementary_cpu
 from torchrl_pref.acquisition.functions import information_gain
 from torchrl_pref.acquisition.scoring import score_queries
+from torchrl_pref.beliefs.elementary_cpu import cos_sin_single, exp_minus, log_single, logs_of
 from torchrl_pref.beliefs.sampled import Belief
+from torchrl_pref.beliefs.slice_cpu import ELEMENTARY
 from torchrl_pref.compiled import FEWEST, over_sessions, share_out
 from torchrl_pref.questions.choice import evidence_of_gaps
 from torchrl_pref.questions.response_model import ResponseModel
@@ -130,3 +134,32 @@ def test_a_tree_and_a_home_that_cannot_be_written(writable: bool, tmp_path: Path
     assert (done.stdout, done.returncode) == ("42.0\n", 0), done.stderr
     kept = [path.name for path in tmp_path.rglob("double.double-*")]
     assert bool(kept) == writable
+
+
+def test_logarithms_and_angles_are_those_of_the_library() -> None:
+    luck = np.random.default_rng(0)
+    numbers = np.exp(luck.uniform(-700, 700, 10_001))
+    near_one = 1 + luck.uniform(-1e-3, 1e-3, 10_001)
+    for some in (numbers, near_one, np.array([1.0, 0.5, 2.0])):
+        assert np.allclose(logs_of(some), np.log(some), rtol=1e-15, atol=1e-18)
+    with np.errstate(divide="ignore"):
+        odd = np.array([0.0, np.inf, np.nan])
+        assert np.array_equal(logs_of(odd), np.log(odd), equal_nan=True)
+    single = np.array([0.0, 1e-40, 0.25, 3.0])
+    log_single(single)
+    assert np.allclose(single, np.log([1e-30, 1e-30, 0.25, 3.0]), rtol=1e-7)
+    angles = np.concatenate([luck.uniform(-2 * np.pi, 2 * np.pi, 10_001), np.pi * np.arange(-2, 3)])
+    cosine, sine = np.empty_like(angles), np.empty_like(angles)
+    cos_sin_single(angles, cosine, sine)
+    rounded = angles.astype(np.float32).astype(np.float64)
+    assert np.allclose(cosine, np.cos(rounded), rtol=6e-8, atol=1e-12)
+    assert np.allclose(sine, np.sin(rounded), rtol=6e-8, atol=1e-12)
+    for x in (0.0, 0.3, 5.0, 60.0):
+        assert exp_minus(x) == pytest.approx(np.exp(-x), rel=1e-4, abs=2e-7)
+
+
+def test_moves_are_compiled_anew_when_the_file_that_they_call_changes() -> None:
+    """The digest in ``slice_cpu.py`` is that of the file: put it there after a change."""
+    source = Path(str(torchrl_pref.beliefs.elementary_cpu.__file__)).read_bytes()
+    assert hashlib.sha256(source).hexdigest().startswith(ELEMENTARY)
+    assert len(ELEMENTARY) == 12

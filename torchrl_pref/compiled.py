@@ -3,7 +3,7 @@
 It is kept in ``NUMBA_CACHE_DIR`` where that is set, else in ``__pycache__`` beside the source, else
 in the user's cache; where none of these can be written, each process compiles anew. What is kept is
 made anew when its own file changes and not when another does: a compiled function calls only those
-of its own file.
+of its own file, or of one whose digest its own file holds (``beliefs/slice_cpu.py``).
 
 The two long loops over sessions, moves and scores, are shared out among threads, each of which
 takes some of the sessions: as many as ``NUMBA_NUM_THREADS``, by default one for each core. No

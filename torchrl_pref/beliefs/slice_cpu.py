@@ -19,7 +19,12 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_pref.beliefs.elementary_cpu import cos_sin_single, exp_minus, log_single, logs_of
 from torchrl_pref.compiled import compiled
+
+ELEMENTARY = "de85efe24f1e"
+"""The first digits of the SHA-256 of ``elementary_cpu.py``: whoever changes that file has to change
+this one, too, without which the machine code that is kept of it would not be made anew."""
 
 Array = np.ndarray[Any, np.dtype[Any]]
 
@@ -229,9 +234,14 @@ def _search(
     lapses = np.any(floors > 0)
     odds = odds.copy() if lapses else odds
     level = _surprise(circles, raised, ends, floors, odds, cosine, sine, hard, tolerance)
+    meridian, luck = np.abs(pole[1]), np.empty(n)
     for m in range(n):
-        level[m] = power * level[m] - meridians * _log(abs(pole[1, m]))
-        level[m] = min(level[m] - _log(1.0 - uniform[m, 1]), 1e300)  # the impossible stays above
+        luck[m] = 1.0 - uniform[m, 1]
+    log_single(meridian)
+    log_single(luck)
+    for m in range(n):
+        level[m] = power * level[m] - meridians * meridian[m]
+        level[m] = min(level[m] - luck[m], 1e300)  # the impossible stays above
     if hard and not lapses:
         _cut_arcs(arcs, circles, raised, tolerance)
     left, refused = np.arange(n), np.empty(n, np.int64)
@@ -239,14 +249,17 @@ def _search(
         for j in range(n):
             m = left[j]
             angle[j] = arcs[0, m] + uniform[m, i] * (arcs[1, m] - arcs[0, m])
-            cosine[j], sine[j] = math.cos(np.float32(angle[j])), math.sin(np.float32(angle[j]))
+        cos_sin_single(angle[:n], cosine, sine)
         given = circles, raised, ends, floors, odds, cosine[:n], sine[:n]
         surprise = _surprise(*given, hard, tolerance)
+        for j in range(n):
+            m = left[j]
+            meridian[j] = abs(pole[1, m] * cosine[j] - pole[0, m] * sine[j])
+        log_single(meridian[:n])
         n_tried, n = n, 0
         for j in range(n_tried):
             m = left[j]
-            meridian = abs(pole[1, m] * cosine[j] - pole[0, m] * sine[j])
-            if power * surprise[j] <= level[m] + meridians * _log(meridian):
+            if power * surprise[j] <= level[m] + meridians * meridian[j]:
                 turn[m] = angle[j]
             else:
                 arcs[int(angle[j] > 0), m] = angle[j]
@@ -311,7 +324,7 @@ def _surprise(
                     highest[j] = math.inf if gap < -tolerance else highest[j]
                     terms[j] += 1.0 if gap <= tolerance else 0.0
                 else:  # terms · exp(highest) is the sum of exp(-gap), and of one
-                    ratio = _exp_minus(abs(gap + highest[j]))
+                    ratio = exp_minus(abs(gap + highest[j]))
                     terms[j] = terms[j] * ratio + 1.0 if -gap > highest[j] else terms[j] + ratio
                     highest[j] = max(highest[j], -gap)
         start = ends[e]
@@ -323,28 +336,14 @@ def _surprise(
                 total[j], product[j] = total[j] + math.log(product[j]), 1.0
         if floors[e] > 0:  # the floor is added to what this answer alone is likely
             for j in range(n):
-                alone = total[j] - before[j]
-                total[j] = before[j] - math.log(math.exp(-alone) + floors[e] * odds[j])
+                terms[j] = math.exp(before[j] - total[j]) + floors[e] * odds[j]
+            logs = logs_of(terms)
+            for j in range(n):
+                total[j] = before[j] - logs[j]
         if lapses and floors[e] >= 0:
             for j in range(n):
                 before[j] = total[j]
+    logs = logs_of(product)
     for j in range(n):
-        total[j] += math.log(product[j])
+        total[j] += logs[j]
     return total
-
-
-@compiled
-def _exp_minus(x: float) -> float:
-    """exp(-x) of x from 0 on, with an error of at most 2·10⁻⁷: as (exp(-x/1024))^1024, which is
-    computed for several x at once, and the library's exp is not."""
-    x = min(x, 700.0) / 1024
-    power = 1.0 - x + 0.5 * x * x
-    for _ in range(10):
-        power *= power
-    return power
-
-
-@compiled
-def _log(number: float) -> float:
-    """The logarithm, of zero a large negative number."""
-    return math.log(np.float32(max(number, 1e-30)))

@@ -6,6 +6,9 @@ importance sampling or by a walk (``tests/posterior.py``, which shares no code w
 *Bias* is the distance of the mean over all samples from the posterior mean, in posterior standard
 deviations; *variance* is that of all samples about the posterior mean over that of the posterior.
 Cases beyond a bound (.02 either way) get four times the sessions, as chance can put one there.
+
+With ``--drawn N`` the cases are drawn at random (``--seed``): other numbers of features and
+options, other ``tau``, other humans, and in half of them one history after another.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ sys.path[0] = str(Path(__file__).resolve().parents[1])  # this folder's select.p
 
 import csv
 import math
+import random
 import time
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -55,6 +59,9 @@ KINDS = (
 information gain; each answer the least likely one; one question asked again and answered otherwise;
 many answers; tiny and huge features; features that nearly follow from each other."""
 
+THEN = ", then "
+"""Between the kinds of a case whose history is of several, each of a human of its own."""
+
 
 class Case(NamedTuple):
     """What a belief is asked to get right."""
@@ -63,6 +70,7 @@ class Case(NamedTuple):
     options: int
     tau: float | None
     kind: str
+    seed: int = 0
 
     @property
     def model(self) -> ResponseModel:
@@ -90,19 +98,25 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=100, help="M of each (default 100)")
     parser.add_argument("--features", default="2,4,6,8,16", help="numbers of features D")
     parser.add_argument("--options", default="2,3,5", help="numbers of options K")
+    parser.add_argument("--drawn", type=int, help="instead, so many cases drawn at random")
+    parser.add_argument("--seed", type=int, default=0, help="of the draw (default 0)")
     parser.add_argument("--csv", type=Path, help="also write every case to this file")
     parser.add_argument("--workers", type=int, default=2, help="processes (default 2)")
     options = common.start(parser)
     sizes = [int(size) for size in options.features.split(",")]
     options_of = [int(number) for number in options.options.split(",")]
     cases = [Case(*case) for case in product(sizes, options_of, (0.5, 4.5, 30.0, None), KINDS)]
+    if options.drawn is not None:
+        cases = drawn(options.drawn, random.Random(options.seed))
     with ProcessPoolExecutor(options.workers, get_context("spawn"), common.one_thread) as executor:
         jobs = executor.map(
             partial(measure, sessions=options.sessions, n_samples=options.samples), cases
         )
         done = zip(cases, tqdm(jobs, total=len(cases), unit="case"), strict=True)
         results = dict(done if options.csv is None else _written(done, options.csv))
-    common.report(f"Worst of the cases, K = {options.options}", list(_worst(results)), options.json)
+    if options.drawn is None:
+        title = f"Worst of the cases, K = {options.options}"
+        common.report(title, list(_worst(results)), options.json)
     beyond = [
         {**case._asdict(), **measured._asdict()}
         for case, measured in results.items()
@@ -119,7 +133,7 @@ def _written(done: Iterable[tuple[Case, Measured]], path: Path) -> Iterator[tupl
         for case, measured in done:
             tau = "optimal" if case.tau is None else case.tau
             numbers = [f"{number:.4g}" for number in measured]
-            writer.writerow([*case[:2], tau, case.kind, *numbers])
+            writer.writerow([*case[:2], tau, *case[3:], *numbers])
             file.flush()
             yield case, measured
 
@@ -145,9 +159,25 @@ def _is_beyond(measured: Measured) -> bool:
     return measured.bias > BOUND or abs(measured.variance - 1) > BOUND
 
 
+def drawn(count: int, luck: random.Random) -> list[Case]:
+    """Cases drawn at random."""
+    cases = []
+    for _ in range(count):
+        tau = luck.choice((0.2, 1.0, 4.5, 12.0, 100.0, None))
+        kind = luck.choice(KINDS)
+        # Two humans who never err are one who contradicts themselves: nobody is left.
+        if tau is not None and luck.random() < 0.5:
+            kind += THEN + luck.choice([each for each in KINDS if each != "60 answers"])
+        features, options = luck.choice((2, 3, 5, 7, 10, 12)), luck.choice((2, 3, 4, 6))
+        cases.append(Case(features, options, tau, kind, luck.randrange(10**6)))
+    return cases
+
+
 def measure(case: Case, sessions: int, n_samples: int = 100) -> Measured:
     """One case; four times the sessions where the first ones are beyond a bound."""
-    gaps = history(case)
+    kinds = case.kind.split(THEN)
+    parts = [history(case._replace(kind=each), case.seed + n) for n, each in enumerate(kinds)]
+    gaps = torch.cat(parts)
     exact = posterior(gaps.double().numpy(), case.tau)
     measured = compare(case, gaps, exact, sessions, n_samples)
     if _is_beyond(measured):

@@ -7,8 +7,9 @@ importance sampling or by a walk (``tests/posterior.py``, which shares no code w
 deviations; *variance* is that of all samples about the posterior mean over that of the posterior.
 Cases beyond a bound (.02 either way) get four times the sessions, as chance can put one there.
 
-With ``--drawn N`` the cases are drawn at random (``--seed``): other numbers of features and
-options, other ``tau``, other humans, and in half of them one history after another.
+With ``--drawn N`` so many cases are drawn at random (``--seed``) instead, and those beyond the
+bound are all that is told: other numbers of features and options, other ``tau``, other humans, and
+in half of them one history after another.
 """
 
 from __future__ import annotations
@@ -122,7 +123,8 @@ def main() -> None:
         for case, measured in results.items()
         if _is_beyond(measured)
     ]
-    common.report(f"Beyond {BOUND}: {len(beyond)} of {len(results)} cases", beyond, None)
+    path = None if options.drawn is None else options.json
+    common.report(f"Beyond {BOUND}: {len(beyond)} of {len(results)} cases", beyond, path)
 
 
 def _written(done: Iterable[tuple[Case, Measured]], path: Path) -> Iterator[tuple[Case, Measured]]:

@@ -1,6 +1,6 @@
 """Logarithms, exponentials, cosines and sines for compiled loops: of several numbers at once, where
-those of the library are computed one by one. Some are rounded to single precision: they decide
-where samples end up, and so do it as in earlier versions, bit for bit.
+those of the library are computed one by one. Some are rounded to single precision, as they were
+when the library's were taken: they decide where samples end up.
 
 Shapes: n numbers.
 """
@@ -30,8 +30,8 @@ def exp_minus(x: float) -> float:
 
 @compiled
 def logs_of(numbers: Array) -> Array:
-    """The logarithms (n) of numbers (n) from 0 on, to some 10⁻¹⁶: as ``exp_minus`` of several at
-    once, by the exponent and a series in the mantissa."""
+    """The logarithms (n) of numbers (n), to some 10⁻¹⁶, by the exponent and a series in the
+    mantissa. The numbers are 0, infinite, NaN, or from 10⁻³⁰⁷ on."""
     bits = numbers.view(np.int64)
     mantissas = np.empty(len(bits), np.int64)
     for j in range(len(bits)):

@@ -22,7 +22,7 @@ import numpy as np
 from torchrl_pref.beliefs.elementary_cpu import cos_sin_single, exp_minus, log_single, logs_of
 from torchrl_pref.compiled import compiled
 
-ELEMENTARY = "de85efe24f1e"
+ELEMENTARY_DIGEST = "9808281dfd8b"
 """The first digits of the SHA-256 of ``elementary_cpu.py``: whoever changes that file has to change
 this one, too, without which the machine code that is kept of it would not be made anew."""
 
@@ -332,8 +332,9 @@ def _surprise(
             total[j] += highest[j]
             product[j] *= terms[j]
         if e % 100 == 99 or (lapses and floors[e] >= 0):  # before the product overflows
+            logs = logs_of(product)
             for j in range(n):
-                total[j], product[j] = total[j] + math.log(product[j]), 1.0
+                total[j], product[j] = total[j] + logs[j], 1.0
         if floors[e] > 0:  # the floor is added to what this answer alone is likely
             for j in range(n):
                 terms[j] = math.exp(before[j] - total[j]) + floors[e] * odds[j]

@@ -103,8 +103,9 @@ def parts_of(settings: Settings, *pool_shape: int) -> Iterator[Part]:
     budget, offers = setup["budget"], _offers(settings)
     beliefs = ("belief.samples", "setup.budget")
     if "training" in settings:
-        whole = -(-(offers or budget) // settings["training"]["stages"])
-        steps = settings["training"]["steps"] or whole
+        training = settings["training"]
+        stages = training["stages"] if training["problems"] == "one" else 1
+        steps = training["steps"] or -(-(offers or budget) // stages)
         frames = settings["training"]["sessions"] * steps
         kept = 36.0 * samples * n_features
         n_answers, _, _ = sizes_of(settings, n_options)

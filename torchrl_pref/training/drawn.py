@@ -72,9 +72,9 @@ class DrawnSessions:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Nothing, see :meth:`state_dict`."""
 
-    def collect(self, number: int = 0) -> TensorDict:
-        """All steps of the sessions of another problem, whatever the ``number`` of batches before:
-        see :meth:`Sessions.collect`."""
+    def collect(self, before: int = 0) -> TensorDict:
+        """All steps of the sessions of another problem, however many batches came ``before``: see
+        :meth:`Sessions.collect`."""
         settings = draw_problem(self.settings, self.generator)
         task = make_task(*make_pools(settings), settings["tau"], settings)
         setup = settings["setup"]

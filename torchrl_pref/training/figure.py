@@ -199,8 +199,8 @@ def figure_2(trained: Sequence[Training], path: Path) -> None:
     _legend_above(axis)
     caption(
         figure,
-        "mean of the episodes that ended in an update: all begin together and short ones end\n"
-        "first, so that the curve may rise until every session has ended once",
+        "mean of the episodes that ended in an update: of those that begin together short ones\n"
+        "end first, so that the curve may rise until every session has ended once",
     )
     save_figure(figure, path)
 

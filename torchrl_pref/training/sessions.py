@@ -74,18 +74,19 @@ class Sessions:
         restore_sessions(self.now, state, session, *sizes)
 
     @torch.no_grad()
-    def collect(self, number: int = 0) -> TensorDict:
+    def collect(self, before: int = 0) -> TensorDict:
         """The next T steps (B T), with the values that the critic gives to each state and the next.
 
         Args:
-            number: how many batches came before. In each of the first, one in ``stages`` of the
-                sessions begins again.
+            before: how many batches came before. At the start of each of the first but the very
+                first, until there are as many stages, one in ``stages`` of the sessions begins
+                again.
 
         A batch holds under ``next``: reward and done flags, ``n_asked``, the alignment where a
         session ended (else NaN), and the ``episode_reward`` and ``step_count`` with the step.
         """
-        if 0 < number < self.stages:
-            self._begin_again(torch.arange(self.now.numel()) % self.stages == number)
+        if 0 < before < self.stages:
+            self._begin_again(torch.arange(self.now.numel()) % self.stages == before)
         records, cut_off = [], []
         with set_exploration_type(ExplorationType.RANDOM):
             for t in range(self.steps):

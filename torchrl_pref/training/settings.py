@@ -15,8 +15,9 @@ class TrainingSettings:
         updates: batches that are learned from, each of the sessions' next steps.
         sessions: B, humans questioned side by side.
         steps: T, steps of each session between two updates; None: as many as a session may take,
-            over ``stages``.
-        stages: how many, T steps apart, the sessions of a batch are at.
+            divided by ``stages``.
+        stages: at how many points, T steps apart, the sessions of a batch are; at most as many as
+            T goes into a session. Of ``drawn`` problems each batch has whole sessions.
         optimizer: ``adam`` or ``rmsprop``.
         learning_rate: of the optimizer.
         gamma: discount of the reward for each step; where skips are free, for each question.

@@ -33,8 +33,10 @@ def make_trainer(settings: Settings, task: Problem) -> Trainer:
     algorithm = learn(policy, constants, **own)
     if constants.problems == "drawn":
         return Trainer(DrawnSessions(settings, policy, env, seed), algorithm, seed)
-    stages = constants.stages
-    sessions = Sessions(env, policy, constants.steps or -(-env.max_steps // stages), stages)
+    steps = constants.steps or -(-env.max_steps // constants.stages)
+    # One, where a batch has whole sessions anyway.
+    stages = min(constants.stages, -(-env.max_steps // steps))
+    sessions = Sessions(env, policy, steps, stages)
     return Trainer(sessions, algorithm, seed)
 
 

@@ -203,7 +203,8 @@ class Session(Learned):
         self._n_gone = self._n_offered
 
     def put(self, query: int | Sequence[int], n_offered: int | None = None) -> None:
-        """Ask this question of the pool next, and not the one that the strategy would choose.
+        """Ask this question of the pool next, and not the one that the strategy would choose; it
+        may have been asked before, also with ``repeats`` off.
 
         Args:
             query: its index; for B people one each.

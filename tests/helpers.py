@@ -57,6 +57,16 @@ OF_POLICY: dict[str, dict[str, Any]] = {
 }
 
 
+LEARNS_TO_ASK: dict[str, Any] = {
+    "sessions": 32,
+    "steps": 8,
+    "stages": 1,
+    "optimizer": "adam",
+    "learning_rate": 0.01,
+}
+"""Constants of a training in which the paper's policy learns in the feed that asking pays."""
+
+
 def settings_of(setup: str = "feed", policy: str = "scorer", **training: Any) -> dict[str, Any]:
     return {
         "tau": "noisy",

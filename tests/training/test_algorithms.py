@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from helpers import settings_of, trainer_of
+from helpers import LEARNS_TO_ASK, settings_of, trainer_of
 from tensordict import TensorDictBase
 
 from torchrl_pref.checkpoints.contents import CURVES
@@ -90,14 +90,7 @@ def test_each_pass_takes_a_step_on_each_part(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_ppo_learns_what_the_feed_rewards(tmp_path: Path) -> None:
     """As A2C does, in a third of the updates: asking pays, and the episodes get shorter."""
-    constants = {
-        "sessions": 32,
-        "steps": 8,
-        "stages": 1,
-        "optimizer": "adam",
-        "learning_rate": 0.01,
-    }
-    settings = ppo_settings(policy="paper", updates=20, epochs=4, **constants)
+    settings = ppo_settings(policy="paper", updates=20, epochs=4, **LEARNS_TO_ASK)
     settings |= {"objective": "information_gain", "skip": "regret"}
     trainer, _ = trainer_of(settings)
     trainer.run(tmp_path, lambda: None, logger=[])
@@ -115,8 +108,8 @@ def test_what_is_told_of_an_update(setup: str, algorithm: str, tmp_path: Path) -
     batches: list[TensorDictBase] = []
     collect = trainer.sessions.collect
 
-    def note(number: int) -> Any:
-        batches.append(collect(number))
+    def note(before: int) -> Any:
+        batches.append(collect(before))
         return batches[-1]
 
     trainer.sessions.collect = note  # type: ignore[method-assign]

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import torch
-from helpers import same, settings_of, trained_in_parts, trainer_of
+from helpers import LEARNS_TO_ASK, same, settings_of, trained_in_parts, trainer_of
 from tensordict import TensorDict
 
 from torchrl_pref.build import load_weights, reload_task
@@ -52,14 +52,7 @@ def test_resumed_run_equals_an_uninterrupted_one_bit_for_bit(
 
 def test_a2c_learns_what_the_feed_rewards(tmp_path: Path) -> None:
     """With the paper's ±r reward, asking pays: the episodes get shorter (the paper's Figure 2)."""
-    constants = {
-        "sessions": 32,
-        "steps": 8,
-        "stages": 1,
-        "optimizer": "adam",
-        "learning_rate": 0.01,
-    }
-    settings = settings_of(policy="paper", updates=60, **constants)
+    settings = settings_of(policy="paper", updates=60, **LEARNS_TO_ASK)
     settings |= {"objective": "information_gain", "skip": "regret"}
     trainer, _ = trainer_of(settings)
     trainer.run(tmp_path, lambda: None)

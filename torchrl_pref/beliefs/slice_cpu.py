@@ -19,10 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_pref.beliefs.elementary_cpu import cos_sin_single, exp_minus, log_single, logs_of
+from torchrl_pref.beliefs.elementary_cpu import cos_sin_single, exp_minus, log, log_single
 from torchrl_pref.compiled import compiled
 
-ELEMENTARY_DIGEST = "9808281dfd8b"
+ELEMENTARY_DIGEST = "898406cc5808"
 """The first digits of the SHA-256 of ``elementary_cpu.py``: whoever changes that file has to change
 this one, too, without which the machine code that is kept of it would not be made anew."""
 
@@ -234,28 +234,24 @@ def _search(
     lapses = np.any(floors > 0)
     odds = odds.copy() if lapses else odds
     level = _surprise(circles, raised, ends, floors, odds, cosine, sine, hard, tolerance)
-    meridian, luck = np.abs(pole[1]), np.empty(n)
     for m in range(n):
-        luck[m] = 1.0 - uniform[m, 1]
-    log_single(meridian)
-    log_single(luck)
-    for m in range(n):
-        level[m] = power * level[m] - meridians * meridian[m]
-        level[m] = min(level[m] - luck[m], 1e300)  # the impossible stays above
+        level[m] = power * level[m] - meridians * log_single(abs(pole[1, m]))
+        level[m] -= log_single(1.0 - uniform[m, 1])
+        level[m] = min(level[m], 1e300)  # the impossible stays above
     if hard and not lapses:
         _cut_arcs(arcs, circles, raised, tolerance)
-    left, refused = np.arange(n), np.empty(n, np.int64)
+    left, refused, meridian = np.arange(n), np.empty(n, np.int64), np.empty(n)
     for i in range(2, uniform.shape[1]):
         for j in range(n):
             m = left[j]
             angle[j] = arcs[0, m] + uniform[m, i] * (arcs[1, m] - arcs[0, m])
-        cos_sin_single(angle[:n], cosine, sine)
+        for j in range(n):
+            cosine[j], sine[j] = cos_sin_single(angle[j])
         given = circles, raised, ends, floors, odds, cosine[:n], sine[:n]
         surprise = _surprise(*given, hard, tolerance)
         for j in range(n):
             m = left[j]
-            meridian[j] = abs(pole[1, m] * cosine[j] - pole[0, m] * sine[j])
-        log_single(meridian[:n])
+            meridian[j] = log_single(abs(pole[1, m] * cosine[j] - pole[0, m] * sine[j]))
         n_tried, n = n, 0
         for j in range(n_tried):
             m = left[j]
@@ -332,19 +328,16 @@ def _surprise(
             total[j] += highest[j]
             product[j] *= terms[j]
         if e % 100 == 99 or (lapses and floors[e] >= 0):  # before the product overflows
-            logs = logs_of(product)
             for j in range(n):
-                total[j], product[j] = total[j] + logs[j], 1.0
+                total[j], product[j] = total[j] + log(product[j]), 1.0
         if floors[e] > 0:  # the floor is added to what this answer alone is likely
             for j in range(n):
                 terms[j] = math.exp(before[j] - total[j]) + floors[e] * odds[j]
-            logs = logs_of(terms)
             for j in range(n):
-                total[j] = before[j] - logs[j]
+                total[j] = before[j] - log(terms[j])
         if lapses and floors[e] >= 0:
             for j in range(n):
                 before[j] = total[j]
-    logs = logs_of(product)
     for j in range(n):
-        total[j] += logs[j]
+        total[j] += log(product[j])
     return total

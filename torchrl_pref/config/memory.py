@@ -106,7 +106,7 @@ def parts_of(settings: Settings, *pool_shape: int) -> Iterator[Part]:
         training = settings["training"]
         stages = training["stages"] if training["problems"] == "one" else 1
         steps = training["steps"] or -(-(offers or budget) // stages)
-        frames = settings["training"]["sessions"] * steps
+        frames = training["sessions"] * steps
         kept = 36.0 * samples * n_features
         n_answers, _, _ = sizes_of(settings, n_options)
         kept += 5.0 * (budget * (16 + 4 * n_answers) + 8 * offers + 100)

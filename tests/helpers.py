@@ -101,6 +101,7 @@ def settings_of(setup: str = "feed", policy: str = "scorer", **training: Any) ->
             # Not a divisor of the episode, so that batches end in mid-session.
             "steps": 3,
             "stages": 4,
+            "processes": 1,
             "optimizer": "rmsprop",
             "learning_rate": 0.01,
             "gamma": 0.99,

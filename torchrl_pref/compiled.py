@@ -41,6 +41,11 @@ _threads = config.NUMBA_NUM_THREADS
 """Numba's own may be set again at any compilation."""
 
 
+def n_threads() -> int:
+    """How many threads long loops are shared out among."""
+    return _threads
+
+
 def share_out(threads: int) -> None:
     """From now on, in this process, share long loops out among so many threads."""
     global _threads

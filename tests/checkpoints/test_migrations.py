@@ -54,10 +54,13 @@ def test_shipped_policies_are_brought_up_to_date(path: Path) -> None:
 
 def test_no_number_of_older_settings_is_lost() -> None:
     settings = {"grid": {"size": 5, "length": 7}, "tau_spread": 4, "belief": {"samples": 30}}
+    settings["training"] = {"sessions": 128}
     migrate(settings)
     assert settings["task"] == {"name": "gridworld", "size": 5, "length": 7}
     assert settings["human"] == {"name": "simulated", "spread": 4, "tau": None, "lapse": 0.0}
     assert settings["demonstrations"]["count"] == 0
+    one = {"problems": "one", "stages": 1, "processes": 1}
+    assert settings["training"] == {"sessions": 128, **one}
     assert settings["belief"] == {"name": "sampled", "samples": 30, "lapse": 0.0}
 
 

@@ -20,10 +20,10 @@ from torchrl_pref.storage.files import load_safely
 
 KIND = "torchrl_pref checkpoint"
 
-FORMAT = 9
+FORMAT = 10
 """Raised whenever a key of the settings or of the checkpoint comes, goes or changes its meaning."""
 
-READABLE = (4, 5, 6, 7, 8, FORMAT)
+READABLE = (4, 5, 6, 7, 8, 9, FORMAT)
 """Formats that can be read, the older ones by :mod:`torchrl_pref.checkpoints.migrations`."""
 
 

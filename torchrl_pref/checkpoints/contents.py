@@ -49,6 +49,7 @@ SECTIONS: dict[str, dict[str, Types]] = {
     "evaluation": {"humans": WHOLE, "seed": WHOLE, "during": WHOLE, "metrics": (list,)},
     "training": {
         **dict.fromkeys(("updates", "sessions", "critic_steps", "warm_up", "save_every"), WHOLE),
+        **dict.fromkeys(("stages", "processes"), WHOLE),
         **dict.fromkeys(("learning_rate", "gamma", "lmbda", "entropy", "critic"), NUMBER),
         **dict.fromkeys(("grad_norm", "average"), NUMBER),
         "steps": WHOLE + NONE,

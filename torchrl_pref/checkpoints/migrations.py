@@ -50,10 +50,12 @@ def migrate(settings: Any) -> None:
     # There were no batches.
     if isinstance(settings.get("setup"), dict) and settings["setup"].get("name") == "query":
         settings["setup"].setdefault("batch", 1)
-    # Up to format 7 a training was about one problem, and up to format 8 sessions began together.
+    # Up to format 7 a training was about one problem, up to format 8 sessions began together, and
+    # up to format 9 one process asked them.
     if isinstance(settings.get("training"), dict):
         settings["training"].setdefault("problems", "one")
         settings["training"].setdefault("stages", 1)
+        settings["training"].setdefault("processes", 1)
     settings.setdefault("question", {"name": "choice"})
     if isinstance(settings.get("belief"), dict):
         settings["belief"] = {"name": "sampled", "lapse": 0.0, **settings["belief"]}

@@ -75,6 +75,7 @@ class TrainingSection(TypedDict):
     sessions: int
     steps: int | None
     stages: int
+    processes: int
     optimizer: str
     learning_rate: float
     gamma: float

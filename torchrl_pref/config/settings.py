@@ -89,6 +89,7 @@ TRAINING: dict[str, Check] = {
     "training.sessions": count(1),
     "training.steps": optional(count(1)),
     "training.stages": count(1),
+    "training.processes": count(1, LARGEST_THREADS),
     "training.optimizer": choice("adam", "rmsprop"),
     "training.learning_rate": positive(1.0),
     "training.gamma": check_share,

@@ -6,6 +6,7 @@ A policy that is trained so has seen neither one task nor one kind of human, and
 from __future__ import annotations
 
 import math
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, cast
 
 import torch
@@ -64,6 +65,10 @@ class DrawnSessions:
         self.settings, self.policy, self.env = settings, policy, env
         self.frames = settings["training"]["sessions"] * env.max_steps
         self.generator = Generator().manual_seed(seed)
+
+    def apart(self) -> AbstractContextManager[None]:
+        """Nothing: all sessions are asked here."""
+        return nullcontext()
 
     def state_dict(self) -> dict[str, Any]:
         """Nothing: no session outlives its batch."""

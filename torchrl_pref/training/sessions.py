@@ -5,6 +5,7 @@ Shapes: B sessions side by side, T steps of each in a batch.
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import torch
@@ -58,6 +59,10 @@ class Sessions:
     def generator(self) -> torch.Generator:
         """Of all luck but that of the actions."""
         return self.env.generator
+
+    def apart(self) -> AbstractContextManager[None]:
+        """Nothing: all sessions are asked here, see :mod:`torchrl_pref.training.parts`."""
+        return nullcontext()
 
     def state_dict(self) -> dict[str, Any]:
         """The sessions as they stand, without what the policy wrote beside them."""

@@ -33,6 +33,9 @@ class TrainingSettings:
         average: share of the old that the moving average of the weights keeps at each update; the
             average is what is saved and evaluated, as it is steadier. 0 averages nothing.
         save_every: updates between two checkpoints.
+        processes: in so many parts the sessions are asked, each in a process of its own if there
+            are cores for all, else in turn, with the same result; fewer where a part would have
+            less than 64 sessions, or problems are ``drawn``.
         problems: ``one``, that of the run; or ``drawn``: another for each batch, drawn at random,
             see :mod:`torchrl_pref.training.drawn`.
 
@@ -55,11 +58,12 @@ class TrainingSettings:
     average: float
     save_every: int
     stages: int = 1
+    processes: int = 1
     problems: str = "one"
 
     def __post_init__(self) -> None:
         check_choice("training.problems", self.problems, ("one", "drawn"))
-        for name in ("updates", "sessions", "stages", "save_every"):
+        for name in ("updates", "sessions", "stages", "processes", "save_every"):
             check_count(f"training.{name}", getattr(self, name), 1)
         if self.steps is not None:
             check_count("training.steps", self.steps, 1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 
 from torchrl_pref.build import make_policy, make_training_env
@@ -11,6 +13,7 @@ from torchrl_pref.errors import check_choice, check_seed
 from torchrl_pref.problem import Problem
 from torchrl_pref.training.algorithms import ALGORITHMS
 from torchrl_pref.training.drawn import DrawnSessions
+from torchrl_pref.training.parts import SessionParts, make_part, seeds_of_part, sizes_of_parts
 from torchrl_pref.training.sessions import Sessions
 from torchrl_pref.training.settings import TrainingSettings
 from torchrl_pref.training.trainer import Trainer
@@ -26,18 +29,24 @@ def make_trainer(settings: Settings, task: Problem) -> Trainer:
     own = dict(settings["algorithm"])
     learn = ALGORITHMS[check_choice("algorithm", own.pop("name"), tuple(ALGORITHMS))]
     seed = check_seed("seed", settings["seed"])
-    env = make_training_env(settings, task, task.train, constants.sessions, seed)
+    drawn = constants.problems == "drawn"
+    here, *others = sizes_of_parts(constants.sessions, 1 if drawn else constants.processes)
+    env = make_training_env(settings, task, task.train, here, seed)
     # The policy's initial weights come from the global generator.
     torch.manual_seed(seed)
     policy = make_policy(settings, env)
     algorithm = learn(policy, constants, **own)
-    if constants.problems == "drawn":
+    if drawn:
         return Trainer(DrawnSessions(settings, policy, env, seed), algorithm, seed)
     steps = constants.steps or -(-env.max_steps // constants.stages)
     # One, where a batch has whole sessions anyway.
     stages = min(constants.stages, -(-env.max_steps // steps))
     sessions = Sessions(env, policy, steps, stages)
-    return Trainer(sessions, algorithm, seed)
+    makes = [
+        partial(make_part, settings, task, steps, stages, size, seeds_of_part(seed, part))
+        for part, size in enumerate(others, start=1)
+    ]
+    return Trainer(SessionParts(sessions, makes) if makes else sessions, algorithm, seed)
 
 
 def make_checkpoint(settings: Settings, task: Problem, trainer: Trainer) -> Checkpoint:

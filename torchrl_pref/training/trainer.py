@@ -30,6 +30,7 @@ from torchrl_pref.policies.base import Policy
 from torchrl_pref.training.actor_critic import ActorCritic
 from torchrl_pref.training.drawn import DrawnSessions
 from torchrl_pref.training.loggers import opened
+from torchrl_pref.training.parts import SessionParts
 from torchrl_pref.training.progress import Progress
 from torchrl_pref.training.sessions import Sessions
 from torchrl_pref.training.settings import TrainingSettings
@@ -53,7 +54,7 @@ class Trainer:
     """
 
     def __init__(
-        self, sessions: Sessions | DrawnSessions, algorithm: ActorCritic, seed: int
+        self, sessions: Sessions | SessionParts | DrawnSessions, algorithm: ActorCritic, seed: int
     ) -> None:
         torch.manual_seed(seed)
         self.sessions, self.algorithm = sessions, algorithm
@@ -96,7 +97,8 @@ class Trainer:
         """
         settings, progress = self.settings, self.progress
         bar = tqdm(total=settings.updates, initial=progress.update, desc="training", unit="update")
-        with bar, _stop_request() as stopped, opened(logger, folder, self.sessions.frames) as logs:
+        logs_of = opened(logger, folder, self.sessions.frames)
+        with bar, _stop_request() as stopped, logs_of as logs, self.sessions.apart():
             measure()
             logs.start(progress)
             while progress.update < settings.updates and not stopped():

@@ -18,7 +18,7 @@ from omegaconf import OmegaConf
 from test_cli import keys_of
 
 import typed
-from benchmarks import docs_figures
+from benchmarks import docs_figures, docs_tables
 from torchrl_pref.config.settings import check_evaluate_settings, check_train_settings
 from torchrl_pref.config.study import check_ask_settings
 from torchrl_pref.evaluation.records import Entry, Records
@@ -216,7 +216,7 @@ def test_parts_of_the_docs_are_made_by_commands_that_are_accepted(name: str) -> 
             test_commands_are_accepted(ROOT, command.format(folder="x").partition(" ")[2])
 
 
-@pytest.mark.parametrize("name", docs_figures.GALLERY)
+@pytest.mark.parametrize("name", docs_tables.GALLERY)
 def test_the_gallery_shows_a_task(name: str) -> None:
     """Its section has the command, the picture, and each feature by its name."""
     sections = (ROOT / "docs" / "gallery.md").read_text().split("\n## ")
@@ -239,9 +239,9 @@ def test_a_cell_of_the_protocol_is_a_table() -> None:
         entries += [
             Entry("heldout", "query/noisy/corners", pool, 0, key, values) for pool in ("0", "1")
         ]
-    greedy, policy = docs_figures.heldout_rows(Records(entries))
+    greedy, policy = docs_tables.heldout_rows(Records(entries))
     assert greedy["RL minus it, after 4"] == "+0.100 [+0.100, +0.100]"
     assert greedy["strategy"].endswith("3 humans a pool")
     assert policy["strategy"] == "**RL**"
     assert policy["reaches 0.500 after"] == "0"
-    assert docs_figures.table([greedy, policy]).startswith("| strategy ")
+    assert docs_tables.table([greedy, policy]).startswith("| strategy ")

@@ -24,7 +24,7 @@ import os
 import re
 import shlex
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import product
 from typing import NamedTuple
 
@@ -51,7 +51,7 @@ class Part(NamedTuple):
     page: str
     commands: tuple[str, ...]
     minutes: float
-    write: Callable[[Path], dict[str, str]]
+    write: docs_tables.Writer
 
 
 HELDOUT, SMALLER = "python evaluate.py protocol=heldout", "pool.size=300"
@@ -75,13 +75,18 @@ def trained(name: str, *settings: str) -> Iterator[str]:
 
 
 def measured(
-    name: str, page: str, minutes: float, more: str = "", script: str | None = None
+    name: str,
+    page: str,
+    minutes: float,
+    more: str = "",
+    script: str | None = None,
+    write: docs_tables.Writer | None = None,
 ) -> Part:
     """A benchmark that writes its table as JSON: of the part's name, or another."""
     command = (
         f"python benchmarks/{script or name}.py {more} --json {{folder}}/{name}.json -> {name}.json"
     )
-    return Part(page, (command,), minutes, benchmark(name))
+    return Part(page, (command,), minutes, write or benchmark(name))
 
 
 SWEEP = "hydra.sweep.dir={folder}/sweep"
@@ -180,9 +185,17 @@ PARTS: dict[str, Part] = {
     ),
     "select": measured("select", "docs/speed.md", 3),
     "limit": measured("limit", "docs/speed.md", 2),
-    "belief": measured("belief", "docs/speed.md", 10),
+    "belief": measured(
+        "belief", "docs/speed.md", 10, write=benchmark("belief", docs_tables.after_twenty)
+    ),
     "session": measured("session", "docs/speed.md", 2),
-    "scale": measured("scale", "docs/speed.md", 5, "--plot {folder}/scale.png"),
+    "scale": measured(
+        "scale",
+        "docs/speed.md",
+        5,
+        "--plot {folder}/scale.png",
+        write=benchmark("scale", docs_tables.ends),
+    ),
     "train": measured("train", "docs/speed.md", 10),
     "main_job": measured("main_job", "docs/speed.md", 7),
     "study": measured("study", "docs/study.md", 15),

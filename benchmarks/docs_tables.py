@@ -35,23 +35,45 @@ GALLERY = ("gridworld", "driver", "lds", "gymnasium")
 
 Rows = list[dict[str, str]]
 
+Writer = Callable[[Path], dict[str, str]]
+"""From a part's folder to its tables by the name of their marks; makes its figures."""
+
 
 def table(rows: Rows) -> str:
     """As Markdown."""
     return tabulate(rows, headers="keys", tablefmt="pipe", disable_numparse=True)
 
 
-def benchmark(name: str) -> Callable[[Path], dict[str, str]]:
-    """The table that a benchmark left as JSON."""
+def benchmark(name: str, choose: Callable[[Any], Any] = lambda rows: rows) -> Writer:
+    """The table that a benchmark left as JSON, or what ``choose`` makes of its rows."""
 
     def write(folder: Path) -> dict[str, str]:
         found = json.loads((folder / f"{name}.json").read_text())
         if (folder / f"{name}.png").exists():
             shutil.copy(folder / f"{name}.png", DOCS)
-        rows = [{key: cell(value) for key, value in row.items()} for row in found["rows"]]
+        rows = [{k: cell(value) for k, value in row.items()} for row in choose(found["rows"])]
         return {name: f"{found['title']}; {found['machine']}.\n\n{table(rows)}"}
 
     return write
+
+
+def after_twenty(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """What ``belief.py`` measured after 20 answers."""
+    return [row for row in rows if row["answers"] == 20]
+
+
+def ends(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A line for each size that ``scale.py`` varied: from where to where, and how it is there."""
+    shown, least = [], {}
+    for row in rows:
+        varied = row["call"], row["varied"]
+        least.setdefault(varied, row[row["varied"]])
+        if row["slope"] is not None:  # the last of them
+            kept = {key: row[key] for key in ("call", "varied")}
+            kept |= {"from": least[varied], "to": row[row["varied"]]}
+            kept["slope at the upper end"] = row["slope"]
+            shown.append({**kept, **{key: row[key] for key in ("CPU s", "call MiB", "in all MiB")}})
+    return shown
 
 
 def beside_aprel(folder: Path) -> dict[str, str]:

@@ -6,6 +6,7 @@ The lines of docs/torchrl.md are here, each run.
 from __future__ import annotations
 
 import contextlib
+import copy
 import functools
 from typing import Any
 
@@ -318,6 +319,12 @@ def test_an_environment_that_is_handed_to_workers_is_another_one_in_each(
 
 def _same(env: FeedEnv) -> FeedEnv:
     return env
+
+
+def test_a_copy_faces_other_humans_unless_it_has_a_seed() -> None:
+    env, seeded = _feed(), _feed(seed=3)
+    assert not torch.equal(copy.deepcopy(env).reset()["samples"], env.reset()["samples"])
+    assert torch.equal(copy.deepcopy(seeded).reset()["samples"], seeded.reset()["samples"])
 
 
 def test_a_seed_is_obeyed_and_its_absence_is_new_each_time() -> None:

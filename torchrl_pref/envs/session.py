@@ -150,15 +150,15 @@ class SessionEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         """Without a seed humans are new ones each time, in whatever process."""
-        self._seed, self._home = seed, os.getpid()
+        self._seed, self._home = seed, (os.getpid(), id(self))
         chosen = int.from_bytes(os.urandom(6), "big") if seed is None else seed
         self._generator = Generator(self.device).manual_seed(chosen)
 
     @property
     def generator(self) -> Generator:
         """The environment's own source of randomness, on its device."""
-        if self._seed is None and self._home != os.getpid():
-            self._set_seed(None)  # this is a copy, in a worker: other humans than the others'
+        if self._seed is None and self._home != (os.getpid(), id(self)):
+            self._set_seed(None)  # this is a copy, here or in a worker: other humans
         elif self._generator.device != self.device:
             self._generator = Generator(self.device).manual_seed(self._generator.initial_seed())
         return self._generator

@@ -35,6 +35,9 @@ GALLERY = ("gridworld", "driver", "lds", "gymnasium")
 
 Rows = list[dict[str, str]]
 
+RULES = ("greedy_information", "greedy_alignment")
+"""The two that no training is needed for."""
+
 Writer = Callable[[Path], dict[str, str]]
 """From a part's folder to its tables by the name of their marks; makes its figures."""
 
@@ -211,17 +214,18 @@ def objectives(folder: Path) -> dict[str, str]:
 
 def beside_information(name: str, records: Records, key: str) -> dict[str, str]:
     """A strategy on the way and in the end, with its difference to information gain."""
-    values, gap = alignment(records, key), difference(records, key, "greedy_information")
+    values, gap = alignment(records, key), difference(records, key, RULES[0])
     row = {"strategy": name}
     row |= {f"after {j}": f"{values[..., j].mean():.3f}" for j in milestones(20)}
-    row["minus information_gain, last"] = interval(gap[..., -1])
+    row["minus information_gain, last"] = "" if key == RULES[0] else interval(gap[..., -1])
     return row
 
 
 def noise_range(folder: Path) -> dict[str, str]:
     """Policies trained at one tau and across the range, where humans differ in theirs."""
     records = read_records(folder / "evaluated" / CSV)
-    rows = [beside_information(name_of(key), records, key) for key in records.strategies]
+    wanted = [*RULES, *filter(is_judged, records.strategies)]
+    rows = [beside_information(name_of(key), records, key) for key in wanted]
     return {"noise_range": table(rows)}
 
 

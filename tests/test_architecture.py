@@ -11,6 +11,7 @@ ORDER = [
     "errors",
     "tensors",
     "compiled",
+    "processes",
     "storage",
     "config",
     "questions",

@@ -39,14 +39,22 @@ TINY = [*TINY_TASK, *FEW, "training.updates=3"]
 SHORT = [*TINY_TASK, *FEW, "training.updates=1", "evaluation.during=0"]
 """For tests that are not about the training itself."""
 
+PARTED = ["training.sessions=128", "training.processes=2"]
+"""With two threads (:func:`start`), sessions that two processes ask."""
 
-def start(script: str, *arguments: str, cwd: Path = ROOT) -> subprocess.Popen[str]:
+
+def start(
+    script: str, *arguments: str, cwd: Path = ROOT, **environment: str
+) -> subprocess.Popen[str]:
+    """A script in a group of processes of its own, as a terminal starts it."""
     return subprocess.Popen(
         [sys.executable, str(ROOT / script), *arguments],
         cwd=cwd,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        start_new_session=True,
+        env={**os.environ, **environment},
         # Tests that run in the background of a shell ignore Ctrl-C, which is not what they test.
         preexec_fn=partial(signal.signal, signal.SIGINT, signal.default_int_handler),
     )
@@ -125,19 +133,24 @@ def test_ppo_resumes_bit_for_bit_whatever_logs(tmp_path: Path) -> None:
     assert tables[0] == tables[1]
 
 
-def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path: Path) -> None:
+@pytest.mark.parametrize("sessions", [FEW, PARTED])
+def test_ctrl_c_saves_and_says_how_to_go_on(sessions: list[str], tmp_path: Path) -> None:
+    """A terminal sends it to all processes."""
     folder = tmp_path / "run"
     long = ["training.updates=100000", "training.save_every=1"]
-    process = start("train.py", *TINY, *long, f"hydra.run.dir={folder}")
+    typed = *TINY, *sessions, *long, f"hydra.run.dir={folder}"
+    process = start("train.py", *typed, NUMBA_NUM_THREADS="2")
     for _ in range(600):
         if (folder / "checkpoint.pt").exists():
             break
         time.sleep(0.1)
-    process.send_signal(signal.SIGINT)
+    os.killpg(process.pid, signal.SIGINT)
     output, _ = process.communicate(timeout=60)
     assert process.returncode == 130
     assert f"train.py resume={folder}" in output
-    assert Checkpoint.load(folder).training["update"] > 0
+    state = Checkpoint.load(folder).training
+    assert state["update"] > 0
+    assert len(state["sessions"].get("others", ())) == (sessions is PARTED)
 
 
 def test_sweep_makes_one_table(tmp_path: Path) -> None:

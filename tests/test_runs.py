@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from hydra import compose, initialize_config_dir
 from scripts import run_script
-from test_cli import ROOT, SHORT, run, start
+from test_cli import PARTED, ROOT, SHORT, run, start
 
 import app
 from torchrl_pref import sweeps
@@ -215,8 +215,10 @@ def test_sweeps_of_other_settings_do_not_mix(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
 def test_jobs_run_under_a_launcher(launcher: str, tmp_path: Path) -> None:
-    chosen = [f"hydra/launcher={launcher}", f"hydra.sweep.dir={tmp_path}"]
-    process = start("train.py", "-m", "setup=query", "tau=-1,2", *SHORT, *chosen)
+    """Each job's training in two processes, too."""
+    chosen = [f"hydra/launcher={launcher}", f"hydra.sweep.dir={tmp_path}", *PARTED]
+    typed = "-m", "setup=query", "tau=-1,2", *SHORT, *chosen
+    process = start("train.py", *typed, NUMBA_NUM_THREADS="2")
     output, errors = process.communicate(timeout=120)
     assert process.returncode == 2
     assert "job 0: failed" in errors.splitlines()[-1]
@@ -224,7 +226,7 @@ def test_jobs_run_under_a_launcher(launcher: str, tmp_path: Path) -> None:
     assert (tmp_path / "1" / "summary.json").exists()
     before = (tmp_path / "1" / "tables.txt").stat().st_mtime_ns
     # What is missing, by whatever launcher.
-    done = run_script("train.py", "-m", "setup=query", "tau=1,2", *SHORT, chosen[1])
+    done = run_script("train.py", "-m", "setup=query", "tau=1,2", *SHORT, *chosen[1:])
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "1" / "tables.txt").stat().st_mtime_ns == before
     assert [row.get("failed") for row in sweeps.write_table(tmp_path)] == [None, None]

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -74,6 +75,13 @@ class QueryPool:
     def __len__(self) -> int:
         return len(self.features)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """By value: torch would put the features of a pool that is on its way to another process
+        into shared memory, of which a container may have little."""
+        where = self.features.device
+        content = self.features.numpy(force=True), where, self.trajectories, self.feature_names
+        return _unreduced, content
+
     @property
     def n_options(self) -> int:
         """K."""
@@ -122,6 +130,16 @@ class QueryPool:
             return cls(features, shown, content.get("feature_names", ()))
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
+
+
+def _unreduced(
+    features: np.ndarray[Any, Any],
+    device: torch.device,
+    trajectories: Tensor | None,
+    names: tuple[str, ...],
+) -> QueryPool:
+    """What :meth:`QueryPool.__reduce__` was called on."""
+    return QueryPool(torch.from_numpy(features).to(device), trajectories, names)
 
 
 def check_alike(train: QueryPool, test: QueryPool) -> None:

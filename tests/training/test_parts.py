@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import copy
+import subprocess
+import sys
 from collections.abc import Iterator
+from functools import partial
 from itertools import count
+from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 from typing import Any
 
@@ -13,18 +17,15 @@ import torch
 from helpers import same, settings_of, trainer_of
 
 from torchrl_pref import compiled
+from torchrl_pref.config.memory import FEWEST, sizes_of_parts
 from torchrl_pref.errors import InputError
 from torchrl_pref.training import parts
-from torchrl_pref.training.parts import (
-    FEWEST,
-    Part,
-    SessionParts,
-    seeds_of_part,
-    sizes_of_parts,
-)
+from torchrl_pref.training.parts import Part, SessionParts, seeds_of_part
 from torchrl_pref.training.worker import Worker
 
 GENERATORS = ("env_generator", "global_generator")
+
+ROOT = Path(__file__).parents[2]
 
 PARTS: dict[str, Any] = {"sessions": 2 * FEWEST, "processes": 2}
 
@@ -116,6 +117,57 @@ def test_a_state_that_lacks_a_part_is_refused(spoiled: str) -> None:
         trainer.sessions.load_state_dict(state)
 
 
+def test_a_part_goes_on_from_what_it_was_a_moment_ago() -> None:
+    """Also where it was asked since: what the policy wrote is not in the state."""
+    trainer, _ = trainer_of(settings_of(**PARTS))
+    sessions = trainer.sessions
+    assert isinstance(sessions, SessionParts)
+    (part,) = sessions.others
+    part.collect(0)
+    state = copy.deepcopy(part.state_dict())
+    once = part.collect(1)
+    part.load_state_dict(state)
+    assert same(once.to_dict(), part.collect(1).to_dict())
+
+
+def test_what_is_sent_to_a_process_is_little_and_takes_no_shared_memory() -> None:
+    trainer, task = trainer_of(settings_of(**PARTS))
+    assert task.train.trajectories is not None
+    assert isinstance(trainer.sessions, SessionParts)
+    (make,) = trainer.sessions.makes
+    assert isinstance(make, partial)
+    _, sent, *_ = make.args
+    assert sent.train.trajectories is None
+    ForkingPickler.dumps(sent.train)
+    assert not sent.train.features.is_shared()
+    there = ForkingPickler.loads(ForkingPickler.dumps(task.train))
+    assert torch.equal(there.features, task.train.features)
+    assert torch.equal(there.trajectories, task.train.trajectories)
+    assert there.feature_names == task.train.feature_names
+
+
+ALONE = """
+import os, signal
+from torchrl_pref.training.worker import Worker
+worker = Worker(list, 1, {})
+for number in (signal.SIGINT, signal.SIGTERM):
+    os.kill(worker.process.pid, number)
+worker.tell({})
+try:
+    worker.answer()
+except RuntimeError as error:
+    print("answered:", error)
+"""
+
+
+def test_signals_are_not_for_a_worker_and_one_left_open_ends() -> None:
+    """In a process that has started no other: the first start lets signals through."""
+    command = [sys.executable, "-c", ALONE]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=ROOT)
+    assert "answered: in a process" in done.stdout, done.stderr
+    assert done.returncode == 0
+
+
 TRIES = count()
 
 
@@ -134,6 +186,6 @@ def test_what_goes_wrong_in_another_process_is_told() -> None:
     with pytest.raises(RuntimeError, match="ZeroDivisionError: no such part"):
         worker.answer()
     worker.process.kill()
-    with pytest.raises(InputError, match=r"status -9.*resume="):
+    with pytest.raises(InputError, match=r"status -9.*resume=.*NUMBA_NUM_THREADS"):
         worker.answer()
     worker.close()

@@ -38,6 +38,12 @@ UNIFORMS = 18
 SHORTLIST = 20
 """Candidates for each question of a batch, see ``strategies.batches``."""
 
+PROCESS = 5.2e8
+"""Of a process that asks sessions: torch, TorchRL and Numba."""
+
+FEWEST = 64
+"""Sessions that a part has at least: with fewer, what is saved hardly pays for the processes."""
+
 SHOWN = ("demonstrations.count", "demonstrations.alternatives")
 
 LIMIT_FILES = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
@@ -105,7 +111,7 @@ def parts_of(settings: Settings, *pool_shape: int) -> Iterator[Part]:
     if "training" in settings:
         training = settings["training"]
         stages = training["stages"] if training["problems"] == "one" else 1
-        steps = training["steps"] or -(-(offers or budget) // stages)
+        steps, _ = steps_and_stages(training["steps"], stages, offers or budget)
         frames = training["sessions"] * steps
         kept = 36.0 * samples * n_features
         n_answers, _, _ = sizes_of(settings, n_options)
@@ -115,6 +121,7 @@ def parts_of(settings: Settings, *pool_shape: int) -> Iterator[Part]:
         own = "setup.offers" if setup["name"] == "feed" else "setup.candidates"
         keys = ("training.sessions", "training.steps", "training.stages", *beliefs, *sizes, own)
         yield Part("training", frames * kept, keys)
+        yield Part("the processes", PROCESS * n_parts(settings), ("training.processes",))
     humans = settings["evaluation"]["humans"]
     if settings.get("protocol") is not None:
         humans = HELD_OUT * settings["workers"]
@@ -127,6 +134,31 @@ def parts_of(settings: Settings, *pool_shape: int) -> Iterator[Part]:
         probs = min(n_queries, SHORTLIST * batch) * samples * sizes_of(settings, n_options)[0]
         yield Part("choosing a batch", 24.0 * probs, ("setup.batch", "belief.samples", *sizes))
     yield from _belief_parts(settings, n_options, n_features)
+
+
+def sizes_of_parts(sessions: int, processes: int) -> list[int]:
+    """B, in as many parts as there are to be processes, or as many as are worth it."""
+    count = max(1, min(processes, sessions // FEWEST))
+    return [sessions // count + (part < sessions % count) for part in range(count)]
+
+
+def steps_and_stages(steps: int | None, stages: int, longest: int) -> tuple[int, int]:
+    """T, and how many stages there are: one where a batch has whole sessions anyway.
+
+    Args:
+        steps, stages: as in the settings.
+        longest: steps that a session may take.
+    """
+    steps = steps or -(-longest // stages)
+    return steps, min(stages, -(-longest // steps))
+
+
+def n_parts(settings: Settings) -> int:
+    """Processes that ask the sessions of a training, at most."""
+    training = settings.get("training")
+    if training is None or training["problems"] == "drawn" or settings["device"] != "cpu":
+        return 1
+    return len(sizes_of_parts(training["sessions"], training["processes"]))
 
 
 def sizes_of(settings: Settings, n_options: int) -> tuple[int, int, int]:
@@ -172,11 +204,11 @@ def _belief_parts(settings: Settings, n_options: int, n_features: int) -> Iterat
     if belief["name"] == "laplace":
         there = settings["setup"]["budget"] * n_factors * n_rows + _rows_shown(settings)
         each = laplace_numbers(samples, there, n_features)
-        held = max(each, min(sessions * each, LAPLACE_HELD))
+        held = max(each, min(sessions * each, n_parts(settings) * LAPLACE_HELD))
         yield Part("the Gaussian of belief=laplace", 8.0 * LAPLACE_COPIES * held, keys)
     else:
         moves = belief.get("moves") or default_moves(n_features)
-        at_once = max(samples, min(sessions * samples, MOVED // moves))
+        at_once = max(samples, min(sessions * samples, n_parts(settings) * (MOVED // moves)))
         directions = 4.0 * (UNIFORMS * moves + 4 * n_features) * at_once
         yield Part("moving the belief", directions, ("belief.samples", "belief.moves"))
         answers = 8.0 * _padded_rows(settings, n_factors, n_rows) * at_once

@@ -33,6 +33,7 @@ from torchrl_pref.evaluation.heldout_pool import (
 )
 from torchrl_pref.evaluation.records import Records
 from torchrl_pref.groups import OWN, TABLES, allow, allowed, make
+from torchrl_pref.processes import spawning
 from torchrl_pref.tasks.base import Task
 
 POOLS, BALANCED_POOLS = 10, 3
@@ -68,7 +69,8 @@ def run_protocol(
     # One file descriptor for each tensor that is passed would be too many for some systems.
     torch.multiprocessing.set_sharing_strategy("file_system")
     context = get_context("spawn")
-    with ProcessPoolExecutor(workers, context, _start_worker, (allowed(),)) as executor:
+    options = workers, context, _start_worker, (allowed(),)
+    with spawning(), ProcessPoolExecutor(*options) as executor:
         closely = [job for job in jobs if job.cell.features in CLOSELY and job.pool == 0]
         feeds = {job.cell: job for job in closely if job.cell.setup == "feed"}
         fits = [replace(job, learned={}, own=(), thresholds=THRESHOLDS) for job in feeds.values()]

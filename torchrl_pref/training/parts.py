@@ -12,7 +12,7 @@ Shapes: B sessions side by side, T steps of each in a batch.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import numpy as np
@@ -32,25 +32,16 @@ from torchrl_pref.problem import Problem
 from torchrl_pref.training.sessions import Sessions
 from torchrl_pref.training.worker import Message, Worker
 
-FEWEST = 64
-"""Sessions that a part has at least: with fewer, what is saved hardly pays for the processes."""
-
-
-def sizes_of_parts(sessions: int, processes: int) -> list[int]:
-    """B, in as many parts as there are to be processes, or as many as are worth it."""
-    count = max(1, min(processes, sessions // FEWEST))
-    return [sessions // count + (part < sessions % count) for part in range(count)]
-
 
 def seeds_of_part(seed: int, part: int) -> tuple[int, int]:
     """Of the humans of a part and of the actions there; the first part has the run's own.
 
     A generator of torch on the CPU knows 32 bits of its seed, so the parts' are mixed and not
-    added.
+    added. The upper half of them is for evaluations during a training.
     """
     if part == 0:
         return seed, seed
-    env, actions = np.random.SeedSequence((seed, part)).generate_state(2)
+    env, actions = np.random.SeedSequence((seed, part)).generate_state(2) >> 1
     return int(env), int(actions)
 
 
@@ -125,24 +116,27 @@ class SessionParts:
 
     @contextmanager
     def apart(self) -> Iterator[None]:
-        """Until the end of the block each part has its own process, if there are cores for all."""
+        """Until the end of the block each part has its own process, if there are cores for all.
+
+        They are spawned, so a script that comes here needs ``if __name__ == "__main__":``. Where
+        the block ends in an error, the parts here are as they were before it.
+        """
         threads, parts = n_threads(), 1 + len(self.others)
-        if threads < parts or self.env.device.type != "cpu":
+        if threads < parts:
             yield
             return
         each = threads // parts
-        share_out(each)
-        try:
-            parts_of = zip(self.makes, self.others, strict=True)
-            self.workers = [Worker(make, each, part.state_dict()) for make, part in parts_of]
+        with ExitStack() as stack:
+            stack.callback(share_out, threads)
+            share_out(each)
+            stack.callback(self.workers.clear)
+            for make, part in zip(self.makes, self.others, strict=True):
+                worker = Worker(make, each, part.state_dict())
+                stack.callback(worker.close)
+                self.workers.append(worker)
             yield
             for state, part in zip(self._states(), self.others, strict=True):
                 part.load_state_dict(state)
-        finally:
-            share_out(threads)
-            for worker in self.workers:
-                worker.close()
-            self.workers = []
 
     def collect(self, before: int = 0) -> TensorDict:
         """As :meth:`Sessions.collect`, of all parts (B T)."""

@@ -74,6 +74,7 @@ class Sessions:
         Raises:
             InputError: the state was taken of other sessions.
         """
+        self.now = self.now.select(*self._state_keys)
         session = self.now.select(*self.env.state_spec.keys())
         sizes = len(self.env.features), self.env.n_answers
         restore_sessions(self.now, state, session, *sizes)

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import torch
 
-from torchrl_pref.build import make_policy, make_training_env
+from torchrl_pref.build import check_device, make_policy, make_training_env
 from torchrl_pref.checkpoints.checkpoint import Checkpoint
+from torchrl_pref.config.memory import sizes_of_parts, steps_and_stages
 from torchrl_pref.config.sections import Settings
 from torchrl_pref.errors import check_choice, check_seed
 from torchrl_pref.problem import Problem
 from torchrl_pref.training.algorithms import ALGORITHMS
 from torchrl_pref.training.drawn import DrawnSessions
-from torchrl_pref.training.parts import SessionParts, make_part, seeds_of_part, sizes_of_parts
+from torchrl_pref.training.parts import SessionParts, make_part, seeds_of_part
 from torchrl_pref.training.sessions import Sessions
 from torchrl_pref.training.settings import TrainingSettings
 from torchrl_pref.training.trainer import Trainer
@@ -30,7 +32,9 @@ def make_trainer(settings: Settings, task: Problem) -> Trainer:
     learn = ALGORITHMS[check_choice("algorithm", own.pop("name"), tuple(ALGORITHMS))]
     seed = check_seed("seed", settings["seed"])
     drawn = constants.problems == "drawn"
-    here, *others = sizes_of_parts(constants.sessions, 1 if drawn else constants.processes)
+    # What a GPU computes at once is best asked at once.
+    parted = not drawn and check_device(settings["device"]).type == "cpu"
+    here, *others = sizes_of_parts(constants.sessions, constants.processes if parted else 1)
     env = make_training_env(settings, task, task.train, here, seed)
     # The policy's initial weights come from the global generator.
     torch.manual_seed(seed)
@@ -38,12 +42,14 @@ def make_trainer(settings: Settings, task: Problem) -> Trainer:
     algorithm = learn(policy, constants, **own)
     if drawn:
         return Trainer(DrawnSessions(settings, policy, env, seed), algorithm, seed)
-    steps = constants.steps or -(-env.max_steps // constants.stages)
-    # One, where a batch has whole sessions anyway.
-    stages = min(constants.stages, -(-env.max_steps // steps))
+    steps, stages = steps_and_stages(constants.steps, constants.stages, env.max_steps)
     sessions = Sessions(env, policy, steps, stages)
+    pool = replace(task.train, trajectories=None)
+    asked = replace(
+        task, train=pool, test=pool
+    )  # what goes to another process is no more than that
     makes = [
-        partial(make_part, settings, task, steps, stages, size, seeds_of_part(seed, part))
+        partial(make_part, settings, asked, steps, stages, size, seeds_of_part(seed, part))
         for part, size in enumerate(others, start=1)
     ]
     return Trainer(SessionParts(sessions, makes) if makes else sessions, algorithm, seed)

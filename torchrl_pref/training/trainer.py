@@ -9,7 +9,7 @@ import math
 import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -98,7 +98,9 @@ class Trainer:
         settings, progress = self.settings, self.progress
         bar = tqdm(total=settings.updates, initial=progress.update, desc="training", unit="update")
         logs_of = opened(logger, folder, self.sessions.frames)
-        with bar, _stop_request() as stopped, logs_of as logs, self.sessions.apart():
+        left = progress.update < settings.updates
+        apart = self.sessions.apart() if left else nullcontext()
+        with bar, _stop_request() as stopped, logs_of as logs, apart:
             measure()
             logs.start(progress)
             while progress.update < settings.updates and not stopped():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import io
 import signal
 import traceback
@@ -16,6 +17,7 @@ import torch
 from torchrl_pref.compiled import share_out
 from torchrl_pref.errors import InputError
 from torchrl_pref.groups import allow, allowed
+from torchrl_pref.processes import spawning, track_resources
 
 if TYPE_CHECKING:
     from torchrl_pref.training.parts import Part
@@ -40,9 +42,11 @@ class Worker:
         self.connection, theirs = context.Pipe()
         arguments = (theirs, make, threads, torch.get_num_threads(), allowed())
         self.process = context.Process(target=_serve, args=arguments, daemon=True)
-        with _signals_for_us():
+        with spawning(), _signals_for_us():
             self.process.start()
         theirs.close()
+        # Where nobody closes it: at the end multiprocessing asks its processes to stop, and waits.
+        atexit.register(self.process.kill)
 
     def tell(self, message: Message) -> None:
         """Say what is to be done next."""
@@ -75,13 +79,18 @@ class Worker:
         self.connection.close()
         self.process.kill()  # by itself it would take a second, and it has nothing to put away
         self.process.join()
+        atexit.unregister(self.process.kill)
 
     def _ended(self) -> InputError:
         self.process.join(10)
+        status = self.process.exitcode
+        why = "what it said is above; a script needs the line if __name__ == '__main__':"
+        if status is None or status <= 0:
+            why = "-9 is what a system does that runs out of memory"
         return InputError(
-            f"a process that asks part of the training's sessions has ended (status "
-            f"{self.process.exitcode}; -9 is what a system does that runs out of memory); go on by "
-            "resume=<run folder>, or start anew with training.processes=1"
+            f"a process that asks part of the training's sessions has ended (status {status}; "
+            f"{why}); go on by resume=<run folder>, with the environment variable "
+            "NUMBA_NUM_THREADS=1 if one process is to ask all"
         )
 
 
@@ -92,6 +101,7 @@ def _signals_for_us() -> Iterator[None]:
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
+    track_resources()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
     try:
         yield
@@ -107,6 +117,8 @@ def _serve(
     typed: frozenset[str],
 ) -> None:
     """Ask the sessions of a part as told, until nobody tells any more."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
     for reference in typed:
         allow(reference)
     torch.set_num_threads(torch_threads)

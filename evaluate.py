@@ -21,7 +21,6 @@ import app
 import typed
 from help_text import CONF
 from torchrl_pref import runs
-from torchrl_pref.config.checks import ONLY_QUERY
 from torchrl_pref.config.sections import GroupSection, Plain, Settings
 from torchrl_pref.config.settings import check_evaluate_settings
 from torchrl_pref.errors import InputError, one_line_errors
@@ -314,12 +313,6 @@ def evaluate_checkpoints(settings: Settings, paths: list[Path]) -> tuple[Records
             build.refuse_own_pools(its_settings, build.human_of(its_settings, task))
             test = build.load_test_pool(named_pool, task)
         tests.append(test)
-        ahead = [name for name in own if name in ONLY_QUERY]
-        if ahead and its_settings["setup"]["name"] == "feed":
-            raise InputError(
-                f"strategy={ahead[0]} beside a policy of a feed: it looks ahead in a pool of "
-                "questions; name runs of setup=query alone, or another strategy"
-            )
         comparison.try_strategies(own, its_settings, task)
     records, trained = Records(), []
     for (its_settings, task, learned), test in zip(groups, tests, strict=True):

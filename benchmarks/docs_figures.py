@@ -89,6 +89,17 @@ def measured(
     return Part(page, (command,), minutes, write or benchmark(name))
 
 
+def on_task(task: str) -> Iterator[str]:
+    """Two trainings on a task, and the held-out protocol there, with the Gridworld's policies."""
+    runs = [f"{{folder}}/{task}-{tau}" for tau in TAUS]
+    for tau, run in zip(TAUS, runs, strict=True):
+        line = f"python train.py task={task} setup=query tau={tau} hydra.run.dir={run}"
+        yield f"{line} -> {task}-{tau}/tables.txt"
+    policies = runs + [f"torchrl_pref/policies/weights/query-{tau}-0.pt" for tau in TAUS]
+    line = f"{HELDOUT} {SMALLER} task={task} checkpoint=[{','.join(policies)}]"
+    yield f"{line} hydra.run.dir={{folder}}/{task}-heldout -> {task}-heldout/{CSV}"
+
+
 SWEEP = "hydra.sweep.dir={folder}/sweep"
 TWO = "hydra/launcher=joblib hydra.launcher.n_jobs=2"
 CELLS = [f"{setup}-{tau}" for setup in ("feed", "query") for tau in ("noisy", "optimal")]
@@ -159,8 +170,14 @@ PARTS: dict[str, Part] = {
             f"{HELDOUT} {SMALLER} task=files task.path={{folder}}/pendulum.csv "
             f"hydra.run.dir={{folder}}/files -> files/{CSV}",
         ),
-        40,
+        11,
         docs_tables.tasks,
+    ),
+    "literature": Part(
+        "docs/results.md",
+        (*on_task("driver"), *on_task("lds")),
+        12,
+        docs_tables.literature,
     ),
     "beyond": Part(
         "docs/results.md",

@@ -1,6 +1,7 @@
 """Imports point downward only, and Hydra stays out of the package (docs/design.md)."""
 
 import ast
+import re
 from pathlib import Path
 
 import torchrl_pref
@@ -73,6 +74,12 @@ def test_imports_point_downward() -> None:
                 other = imported.split(".")[1]
                 assert ORDER.index(other) <= ORDER.index(own), f"{path} imports {imported}"
             assert imported != "torchrl_pref", f"{path} imports the package itself"
+
+
+def test_no_environment_is_asked_of_what_class_it_is() -> None:
+    """It may be a transformed one; ``is_feed`` asks its specs."""
+    for path in sources():
+        assert not re.search(r"isinstance\((self\.)?env, *(Query|Feed)", path.read_text()), path
 
 
 def test_hydra_stays_in_the_scripts() -> None:

@@ -182,7 +182,7 @@ def test_sweep_makes_one_table(tmp_path: Path) -> None:
     ahead = "strategy=lookahead", f"hydra.run.dir={tmp_path}/ahead"
     assert "lookahead" in run("evaluate.py", f"checkpoint={tmp_path}/other/0", *ahead)
     refused = run_script("evaluate.py", f"checkpoint={tmp_path}/sweep/2", *ahead, folder=ROOT)
-    assert "strategy=lookahead beside a policy of a feed" in refused.stderr
+    assert "strategy=lookahead with setup=feed: it is for setup=query alone" in refused.stderr
 
 
 @pytest.mark.parametrize("setup", ["query", "feed"])
@@ -366,7 +366,7 @@ BAD_INPUT = [
     ("evaluate", "policy=scorer", "policy='scorer': expected one of pretrained"),
     ("evaluate", "policy=pretrained checkpoint=x", "name two policies"),
     ("evaluate", "policy=pretrained skip=regret", "expected skip=free; remove skip"),
-    ("evaluate", "strategy=mine", "strategy=mine: expected one of alignment_gain"),
+    ("evaluate", "strategy=mine", "strategy='mine': expected one of random, information_gain"),
     ("evaluate", "strategy=[]", "strategy=[]: expected at least one"),
     ("evaluate", "strategy=no_such_module:rule", "no module no_such_module in"),
     ("evaluate", "strategy=torch:no_such_rule", "has no no_such_rule"),
@@ -418,7 +418,8 @@ BAD_INPUT = [
     ("ask", "participant=../P1", "participant=../P1: expected a code of up to 32 letters"),
     ("ask", "host=1.2.3.4", "host=1.2.3.4 port=0: cannot be served there"),
     ("ask", "port=70000", "port=70000: expected a whole number of at most 65535"),
-    ("ask", "strategy=nonsense", "strategy=nonsense: expected one of policy, alignment_gain"),
+    ("ask", "strategy=nonsense", "strategy='nonsense': expected one of random, information_gain"),
+    ("ask", "strategy=2", "strategy=2: expected a name of docs/strategies.md"),
     ("ask", "strategy=builtins:repr", "strategy makes of an environment of type str"),
     ("ask", "setup=feed strategy=lookahead", "strategy=lookahead with setup=feed"),
     ("ask", "setup.repeats=true", "setup.repeats: people choose from the whole pool"),
@@ -438,11 +439,7 @@ BAD_INPUT = [
     ("ask", "-m tau=1,2", "people answer one study at a time"),
     ("evaluate", "setup=query setup.batch=10 strategy=max_regret", "chooses one query at a time"),
     ("evaluate", "strategy=lookahead", "strategy=lookahead with setup=feed"),
-    (
-        "evaluate",
-        "strategy=lookahead protocol=heldout",
-        "tries no strategy that looks ahead",
-    ),
+    ("evaluate", "strategy=nonsense protocol=heldout", "strategy='nonsense': expected one of"),
     (
         "evaluate",
         "setup=query pool.train={tmp}/ab.pt pool.test={tmp}/ba.pt",

@@ -1,5 +1,7 @@
 """Each file of examples/extending is short, and the main job runs with it from outside."""
 
+import re
+import shlex
 import shutil
 import subprocess
 from collections.abc import Callable
@@ -26,6 +28,9 @@ JOBS = {
     "human": ["human=my_human:Tiring", "human.patience=5"],
     "policy": ["setup=query", "policy=my_policy:perceptron", "policy.width=8"],
 }
+
+ORDER = ("task", "question", "human", "belief", "policy")
+"""On the page."""
 
 
 class Made(NamedTuple):
@@ -67,14 +72,28 @@ def test_the_main_job_runs_with_it(what: str, made: Callable[[str], Made]) -> No
     assert "written to" in done.stdout
 
 
-def test_strategies_are_rows_of_the_table(tmp_path: Path) -> None:
-    mine = "my_strategy:most_different", "my_acquisition:most_disputed"
-    small = "pool.size=40", "setup=query", "setup.budget=3", "tau=noisy", "evaluation.humans=6"
-    typed = f"strategy=[{','.join(mine)}]", f"hydra.run.dir={tmp_path / 'run'}"
-    done = run("evaluate.py", *small, *typed)
+COMMANDS = re.findall(r"`python (\S+\.py [^`]+)`", (ROOT / "docs" / "extending.md").read_text())
+
+
+def test_the_page_trains_with_each() -> None:
+    """As typed above, but for sizes."""
+    trained = [set(shlex.split(line)[1:]) for line in COMMANDS if line.startswith("train.py")]
+    sizes = {"task.steps=12": "task.steps=30", "belief.draws=500": "belief.draws=5000"}
+    sizes |= {"human.patience=5": "human.patience=10", "policy.width=8": "policy.width=32"}
+    assert trained == [{sizes.get(one, one) for one in JOBS[what]} for what in ORDER]
+
+
+@pytest.mark.parametrize("line", [line for line in COMMANDS if line.startswith("evaluate.py")])
+def test_strategies_are_rows_of_the_table(line: str, tmp_path: Path) -> None:
+    script, *typed = shlex.split(line)
+    small = "pool.size=40", "setup.budget=3", "tau=noisy", "evaluation.humans=6"
+    done = run(script, *typed, *small, f"hydra.run.dir={tmp_path / 'run'}")
     assert done.returncode == 0, done.stderr
-    for name in mine:
-        assert name in (tmp_path / "run" / "tables.txt").read_text()
+    (name,) = (one.removeprefix("strategy=") for one in typed if one.startswith("strategy="))
+    assert name in (tmp_path / "run" / "tables.txt").read_text()
+    # In a feed it is refused before anything is run.
+    refused = run(script, *(one for one in typed if one != "setup=query"))
+    assert f"error: strategy={name} with setup=feed: it reads queries" in refused.stderr
 
 
 def test_a_checkpoint_never_names_code_to_import(

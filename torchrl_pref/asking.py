@@ -18,6 +18,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl_pref.beliefs.base import BeliefBase
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
+from torchrl_pref.envs.session import is_feed
 from torchrl_pref.envs.transition import SessionState, Tree
 from torchrl_pref.errors import InputError, check_choice, check_type
 from torchrl_pref.humans.base import REFUSED
@@ -71,12 +72,12 @@ def draw_questions(env: QueryEnv | FeedEnv, size: int, repeats: bool) -> dict[st
 
     Without ``repeats`` a query comes again only after all others.
     """
-    if repeats or not isinstance(env, FeedEnv):
+    if repeats or not is_feed(env):
         return env.draw_questions(size)
-    n_queries = len(env.features)
-    n_passes = -(-env.n_offers // n_queries)
+    n_queries, n_offers = len(env.features), env.max_steps
+    n_passes = -(-n_offers // n_queries)
     keys = torch.rand((size, n_passes, n_queries), generator=env.generator)
-    return {"offers": keys.argsort(-1).flatten(1)[:, : env.n_offers]}
+    return {"offers": keys.argsort(-1).flatten(1)[:, :n_offers]}
 
 
 def strategy_of(strategy: str | MakeStrategy, env: EnvBase) -> TensorDictModuleBase:
@@ -130,9 +131,9 @@ def next_question(
         if isinstance(getattr(module, "generator", None), Generator):
             module.generator.manual_seed(luck)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        if isinstance(env, QueryEnv):
-            return strategy(env.show(state, hidden))["action"], None
-        return _let_through(env, strategy, state, hidden)
+        if is_feed(env):
+            return _let_through(cast(FeedEnv, env), strategy, state, hidden)
+        return strategy(env.show(state, hidden))["action"], None
 
 
 def _let_through(

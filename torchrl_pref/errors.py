@@ -17,6 +17,10 @@ class InputError(ValueError):
     """Input that cannot be used. The message is one line, written for the person who gave it."""
 
 
+class OtherSetup(InputError):
+    """A strategy that is for the other setup alone."""
+
+
 def check_count(name: str, value: Any, minimum: int) -> int:
     """Return ``value`` if it is a whole number of at least ``minimum``.
 

@@ -326,13 +326,7 @@ def test_the_estimate_knows_how_many_answers_there_are() -> None:
             assert memory.sizes_of({"question": {"name": name}}, n_options) == expected
 
 
-def test_the_names_of_strategies_are_those_of_the_tables() -> None:
-    both = {"random", *checks.STRATEGIES}
-    assert set(FEED_STRATEGIES) == both
-    assert set(STRATEGIES) == both | {*checks.ONLY_QUERY}
+def test_every_strategy_has_its_line_in_the_docs() -> None:
     page = (ROOT / "docs" / "strategies.md").read_text()
-    for script in ("ask", "evaluate"):
-        help_text = (ROOT / "conf" / f"{script}.yaml").read_text()
-        for name in (*checks.STRATEGIES, *checks.ONLY_QUERY):
-            assert name in help_text
-            assert f"| `{name}` |" in page
+    for name in {*STRATEGIES, *FEED_STRATEGIES} - {"random"}:
+        assert f"| `{name}` |" in page

@@ -227,7 +227,7 @@ def test_whole_protocol(monkeypatch: pytest.MonkeyPatch) -> None:
     learned = {}
     for setup in ("query", "feed"):
         learned[Cell(setup, "noisy")] = [checkpoint_of({**settings_of(setup), "seed": 3})]
-    records = run_protocol([settings_of("feed")], learned, 1)
+    records = run_protocol([settings_of("feed")], learned, 1, ["lookahead"])
     assert records.tasks == ["query/noisy/corners", "query/noisy/balanced", "feed/noisy/corners"]
     fit = Job(settings_of("feed"), Cell("feed", "noisy"), 0, thresholds=(0.1, 9.0))
     best = (0.1, 9.0)[int(fit_threshold(fit).argmax())]
@@ -235,7 +235,9 @@ def test_whole_protocol(monkeypatch: pytest.MonkeyPatch) -> None:
     assert f"threshold:{best:g}" in feed.strategies
     humans = heldout_pool.HUMANS
     assert query.values("policy_query", "alignment").shape == (1, 1, humans, 5)
-    assert "lookahead" in query.strategies
+    assert "lookahead" in query.strategies  # and left out of the feed
+    with pytest.raises(InputError, match="it is for a setup that no policy here is for"):
+        run_protocol([settings_of("feed")], dict([learned.popitem()]), 1, ["lookahead"])
     strong = query.values("greedy_alignment", "alignment")
     assert strong.shape == (1, heldout_pool.RUNS, humans, 5)
     assert not torch.equal(strong[0, 0], strong[0, 1])  # another luck of the belief

@@ -101,7 +101,7 @@ def test_what_cannot_decide_is_refused_before_anything_is_run(mine: str, pool: Q
             try_own(find_makers([f"{mine}:{name}"]), env)
         assert message in str(refused.value), name
         assert "\n" not in str(refused.value)
-    with pytest.raises(InputError, match="its first decision in a FeedEnv fails"):
+    with pytest.raises(InputError, match="it reads action_mask, which setup=query alone shows"):
         try_own(find_makers([f"{mine}:first"]), make(FeedEnv, pool, batch=2))
 
 

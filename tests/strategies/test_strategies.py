@@ -279,5 +279,5 @@ def test_knowledge_gradient_is_of_the_pool_that_is_asked_about(pool: QueryPool) 
     acquisition = STRATEGIES["knowledge_gradient"](env).acquisition
     assert isinstance(acquisition, KnowledgeGradient)
     assert torch.equal(acquisition.trajectories, pool.features.flatten(0, 1).unique(dim=0))
-    with pytest.raises(InputError, match="strategy='lookahead': expected one of random"):
+    with pytest.raises(InputError, match="strategy=lookahead with setup=feed"):
         make_strategy("lookahead", make(FeedEnv, pool))

@@ -30,22 +30,6 @@ EXTRAS = ("wandb", "mlflow")
 PER_SECOND = ("information_per_second", "alignment_per_second")
 """Strategies that count the seconds a question takes."""
 
-STRATEGIES = (
-    "alignment_gain",
-    "information_gain",
-    "volume_removal",
-    "max_regret",
-    "disagreement",
-    "thompson",
-    "least_confidence",
-    "knowledge_gradient",
-    *PER_SECOND,
-)
-"""Those that either setup knows by name, beside ``random`` (docs/strategies.md)."""
-
-ONLY_QUERY = ("lookahead", "alignment_lookahead")
-"""What looks ahead in a pool of questions, and has none in a feed."""
-
 
 def check_tau(name: str, value: Any) -> None:
     """Refuse what is no kind of human.
@@ -141,23 +125,18 @@ def check_loggers(name: str, value: Any) -> None:
             )
 
 
-def strategy(*known: str) -> Check:
-    """What refuses all but strategies of the package, by name, and ``module:name`` of the user's.
+def check_strategy(name: str, value: Any) -> None:
+    """Refuse what is neither a name, which the package is to know, nor ``module:name``.
 
-    Args:
-        known: the names.
+    Raises:
+        InputError: it is neither.
     """
-
-    def check(name: str, value: Any) -> None:
-        if value not in known and not (
-            isinstance(value, str) and re.fullmatch(r"[^\W\d][\w.]*:[^\W\d]\w*", value)
-        ):
-            raise InputError(
-                f"{name}={value!s:.80}: expected one of {', '.join(known)}, or <module>:<name> of "
-                f"yours, as in {name}=mine:Rule for what Rule of mine.py makes of the environment"
-            )
-
-    return check
+    if not isinstance(value, str) or not re.fullmatch(r"([^\W\d][\w.]*:)?[^\W\d]\w*", value):
+        raise InputError(
+            f"{name}={value!s:.80}: expected a name of docs/strategies.md, such as alignment_gain, "
+            f"or <module>:<name> of yours, as in {name}=mine:Rule for what Rule of mine.py makes "
+            "of the environment"
+        )
 
 
 def optional(check: Check) -> Check:

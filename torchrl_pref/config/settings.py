@@ -17,13 +17,12 @@ from torchrl_pref.config.checks import (
     COST,
     LARGEST_TAU,
     LARGEST_THREADS,
-    ONLY_QUERY,
-    STRATEGIES,
     Check,
     check_device,
     check_loggers,
     check_path,
     check_spread,
+    check_strategy,
     check_tau,
     choice,
     count,
@@ -31,7 +30,6 @@ from torchrl_pref.config.checks import (
     one_or_more,
     optional,
     positive,
-    strategy,
 )
 from torchrl_pref.config.memory import check_memory
 from torchrl_pref.config.sections import Plain, Settings
@@ -39,7 +37,6 @@ from torchrl_pref.config.together import (
     check_drawn,
     check_together,
     refuse_batches,
-    refuse_lookahead,
 )
 from torchrl_pref.errors import (
     InputError,
@@ -116,7 +113,7 @@ EVALUATE: dict[str, Check] = {
     "tasks": optional(one_or_more(choice(*PROTOCOL_TASKS))),
     "workers": count(1, LARGEST_THREADS),
     "checkpoint": optional(one_or_more(check_path)),
-    "strategy": optional(one_or_more(strategy(*STRATEGIES, *ONLY_QUERY))),
+    "strategy": optional(one_or_more(check_strategy)),
     **COST,
 }
 """Of evaluate.py."""
@@ -237,13 +234,6 @@ def check_evaluate_settings(settings: Plain) -> Settings:
     for name in [named] if isinstance(named, str) else named or []:
         if ":" not in name:
             refuse_batches(settings, f"strategy={name}")
-        if settings["protocol"] is not None and name in ONLY_QUERY:
-            raise InputError(
-                f"strategy={name}: the protocol tries no strategy that looks ahead; name another, "
-                "or leave protocol= out"
-            )
-        if settings["checkpoint"] is None:  # else the setup is the checkpoint's
-            refuse_lookahead(settings["setup"]["name"], name)
     check_together(settings)
     in_feed = "policy" in settings and settings["setup"]["name"] == "feed"
     if in_feed and settings["skip"] != "free":
@@ -295,7 +285,8 @@ def _group_checks(
         raise InputError(f"{group} is missing: expected one; type {options}")
     name = settings[group]["name"]
     if group in open_groups(settings):
-        return {f"{group}.name": _anything}
+        of_all: dict[str, Check] = {"policy.sample": check_flag} if group == "policy" else {}
+        return {f"{group}.name": _anything, **of_all}
     check_choice(group, name, tuple(tables))
     return {f"{group}.name": choice(name), **tables[name]}
 

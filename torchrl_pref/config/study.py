@@ -8,20 +8,18 @@ from typing import Any
 from torchrl_pref.config.checks import (
     COST,
     LARGEST_THREADS,
-    ONLY_QUERY,
-    STRATEGIES,
     Check,
     check_path,
+    check_strategy,
     check_tau,
     choice,
     count,
     one_or_more,
     optional,
-    strategy,
 )
 from torchrl_pref.config.sections import Plain
 from torchrl_pref.config.settings import OTHERS, check_keys
-from torchrl_pref.config.together import check_belief, check_options, refuse_lookahead
+from torchrl_pref.config.together import check_belief, check_options
 from torchrl_pref.errors import (
     InputError,
     check_between,
@@ -76,7 +74,7 @@ KEYS: dict[str, Check] = {
     "host": _check_host,
     "port": count(0, 65535),
     "open": check_flag,
-    "strategy": strategy("policy", *STRATEGIES, "random", *ONLY_QUERY),
+    "strategy": check_strategy,
     "tau": check_tau,
     "seed": check_seed,
     "threads": count(1, LARGEST_THREADS),
@@ -132,7 +130,7 @@ def check_ask_settings(settings: Plain) -> Plain:
     """
     groups = {name: OTHERS[name] for name in ("task", "question", "belief")}
     check_keys(settings, KEYS, {"setup": SETUPS, **groups})
-    setup, pool, asks = settings["setup"], settings["pool"], settings["strategy"]
+    setup, pool = settings["setup"], settings["pool"]
     if setup["name"] == "feed":
         if setup["offers"] is not None:
             check_count("setup.offers", setup["offers"], setup["budget"])
@@ -143,7 +141,6 @@ def check_ask_settings(settings: Plain) -> Plain:
                 "questions as stream by, as nobody is asked one twice; raise it, or lower "
                 "setup.offers"
             )
-        refuse_lookahead(setup["name"], asks)
     elif pool["file"] is None and pool["size"] < setup["budget"]:
         raise InputError(
             f"pool.size={pool['size']} with setup.budget={setup['budget']}: expected at least as "

@@ -5,7 +5,6 @@ from __future__ import annotations
 from importlib.util import find_spec
 from typing import Any
 
-from torchrl_pref.config.checks import ONLY_QUERY
 from torchrl_pref.config.sections import Plain
 from torchrl_pref.errors import InputError, check_batch, check_count
 
@@ -109,19 +108,6 @@ def check_drawn(settings: Plain) -> None:
         raise InputError(
             "training.problems=drawn with a belief that has no belief.samples: the belief is "
             "drawn, too, with as many samples as that says; type belief=sampled"
-        )
-
-
-def refuse_lookahead(setup: str, strategy: Any) -> None:
-    """Refuse in a feed what looks ahead in a pool of questions.
-
-    Raises:
-        InputError: it was asked for.
-    """
-    if setup == "feed" and strategy in ONLY_QUERY:
-        raise InputError(
-            f"strategy={strategy} with setup=feed: it looks ahead in a pool of questions; type "
-            "setup=query, or another strategy"
         )
 
 

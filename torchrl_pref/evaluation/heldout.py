@@ -19,7 +19,7 @@ from tqdm import tqdm
 from torchrl_pref.checkpoints.checkpoint import Checkpoint
 from torchrl_pref.compiled import share_out
 from torchrl_pref.config.sections import Plain, Settings, flat
-from torchrl_pref.errors import InputError
+from torchrl_pref.errors import InputError, OtherSetup
 from torchrl_pref.evaluation.comparison import policy_key
 from torchrl_pref.evaluation.heldout_pool import (
     CLOSELY,
@@ -55,7 +55,7 @@ def run_protocol(
         tasks: for each the sections ``task``, ``pool``, ``belief``, ``setup`` and ``device``.
         learned: the policies of each cell, of any kinds and training seeds.
         workers: processes that run pools side by side, one CPU thread each.
-        own: strategies of the user, ``module:name`` of each; they face every cell.
+        own: strategies of the user, ``module:name`` of each; they face every cell of their setup.
 
     Raises:
         InputError: a policy was trained for another budget or cannot face the same offers as the
@@ -63,9 +63,11 @@ def run_protocol(
     """
     pools_of.cache_clear()  # a file of before may hold something else now
     jobs = [job for settings in tasks for job in _jobs(settings, learned, own)]
-    for job in jobs:
-        if job.pool == 0:
-            try_job(job)
+    fitting = {job.cell: try_job(job) for job in jobs if job.pool == 0}
+    for name in own:
+        if not any(name in names for names in fitting.values()):
+            raise OtherSetup(f"strategy={name}: it is for a setup that no policy here is for")
+    jobs = [replace(job, own=fitting[job.cell]) for job in jobs]
     # One file descriptor for each tensor that is passed would be too many for some systems.
     torch.multiprocessing.set_sharing_strategy("file_system")
     context = get_context("spawn")

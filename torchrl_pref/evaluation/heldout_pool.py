@@ -30,7 +30,7 @@ from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.envs.session import is_feed
 from torchrl_pref.evaluation.comparison import FIRST_EVALUATION_SEED
 from torchrl_pref.evaluation.metrics import make_exam
-from torchrl_pref.evaluation.own import find_makers, make_own, try_own
+from torchrl_pref.evaluation.own import find_makers, make_own, of_this_setup
 from torchrl_pref.evaluation.records import Entry, entry_of
 from torchrl_pref.evaluation.run import draw_humans
 from torchrl_pref.evaluation.side_by_side import Entrant, run_side_by_side
@@ -193,8 +193,11 @@ def _make_env(
     return make(settings or job.settings, task, pool, sessions, seed)
 
 
-def try_job(job: Job) -> None:
+def try_job(job: Job) -> tuple[str, ...]:
     """Refuse policies that do not fit a job's pool, and strategies of the user that cannot decide.
+
+    Returns:
+        Those of the user's strategies that are not for the other setup alone.
 
     Raises:
         InputError: there is one.
@@ -203,7 +206,7 @@ def try_job(job: Job) -> None:
     env = _make_env(job, task, pool, 0, 2)
     for one in (one for checkpoints in job.learned.values() for one in checkpoints):
         load_policy(one, env)
-    try_own(find_makers(job.own, job.settings), env)
+    return of_this_setup(find_makers(job.own, job.settings), env)
 
 
 def _judged(job: Job, env: QueryEnv | FeedEnv, seed: int, beside: Sequence[str]) -> list[Entrant]:

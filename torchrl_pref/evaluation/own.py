@@ -12,6 +12,7 @@ Only what the user typed is imported: names come from the command line and never
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 
 import torch
@@ -24,11 +25,11 @@ from torchrl_pref.config.sections import Settings
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.envs.session import is_feed
-from torchrl_pref.errors import InputError
+from torchrl_pref.errors import InputError, OtherSetup, check_choice
 from torchrl_pref.evaluation.side_by_side import Entrant
 from torchrl_pref.evaluation.style import is_there
 from torchrl_pref.groups import load, where
-from torchrl_pref.strategies import make_strategy
+from torchrl_pref.strategies import FEED_STRATEGIES, STRATEGIES, make_strategy
 
 Maker = Callable[[QueryEnv | FeedEnv], TensorDictModuleBase]
 
@@ -49,6 +50,10 @@ def find_makers(typed: Sequence[str], settings: Settings | None = None) -> dict[
     """
     section = None if settings is None else settings.get("cost")
     cost = None if section is None else Cost(**section)
+    known = tuple(dict.fromkeys((*STRATEGIES, *FEED_STRATEGIES)))
+    for name in typed:
+        if ":" not in name:
+            check_choice("strategy", name, known)
     return {
         name: load(f"strategy={name}", name)
         if ":" in name
@@ -77,7 +82,7 @@ def make_own(
         try:
             strategy = maker(env)
         except Exception as error:
-            if ":" not in typed:  # one of ours, which says so itself
+            if ":" not in typed or isinstance(error, InputError):  # which says so itself
                 raise
             raise InputError(
                 f"strategy={typed}: making it for a {type(env).__name__} fails ({where(error)}); "
@@ -92,6 +97,15 @@ def make_own(
     return entrants
 
 
+ALONE = {True: ("offer", "n_offered"), False: ("queries", "action_mask")}
+"""What a feed alone shows, and a pool to choose from."""
+
+
+def hidden_from(strategy: TensorDictModuleBase, env: QueryEnv | FeedEnv) -> list[str]:
+    """What a strategy reads that only the other setup shows."""
+    return [key for key in ALONE[not is_feed(env)] if key in strategy.in_keys]
+
+
 def try_own(makers: Mapping[str, Maker], env: QueryEnv | FeedEnv) -> None:
     """Let each strategy decide once, so that one which cannot is refused before anything is run.
 
@@ -101,8 +115,15 @@ def try_own(makers: Mapping[str, Maker], env: QueryEnv | FeedEnv) -> None:
 
     Raises:
         InputError: a strategy cannot be made, fails, or writes no action of this environment.
+        OtherSetup: it is for the other setup.
     """
     for typed, entrant in zip(makers, make_own(makers, env, 0), strict=True):
+        if unseen := hidden_from(entrant.strategy, env):
+            here, there = ("feed", "query") if is_feed(env) else ("query", "feed")
+            raise OtherSetup(
+                f"strategy={typed} with setup={here}: it reads {unseen[0]}, which setup={there} "
+                "alone shows; type that, or another strategy"
+            )
         try:
             with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
                 decided = entrant.strategy(env.reset())
@@ -116,3 +137,18 @@ def try_own(makers: Mapping[str, Maker], env: QueryEnv | FeedEnv) -> None:
                 f"{'one whole number' if env.batch == 1 else f'{env.batch} whole numbers'} for "
                 "each session"
             ) from error
+
+
+def of_this_setup(makers: Mapping[str, Maker], env: QueryEnv | FeedEnv) -> tuple[str, ...]:
+    """Those of the strategies that are not for the other setup alone; each is tried as by
+    :func:`try_own`.
+
+    Raises:
+        InputError: one cannot decide here.
+    """
+    fitting = []
+    for typed, maker in makers.items():
+        with suppress(OtherSetup):
+            try_own({typed: maker}, env)
+            fitting.append(typed)
+    return tuple(fitting)

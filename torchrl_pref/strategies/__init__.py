@@ -20,7 +20,7 @@ from torchrl_pref.acquisition.knowledge_gradient import KnowledgeGradient
 from torchrl_pref.acquisition.pairs import max_regret
 from torchrl_pref.acquisition.per_second import Cost, PerSecond
 from torchrl_pref.envs.session import is_feed
-from torchrl_pref.errors import check_choice
+from torchrl_pref.errors import OtherSetup, check_choice
 from torchrl_pref.strategies.batches import BatchOf
 from torchrl_pref.strategies.feed import OfferRank, QuantileAsk, RandomAsk, ThresholdAsk
 from torchrl_pref.strategies.lookahead import AlignmentLookahead, Lookahead, check_followed
@@ -110,8 +110,17 @@ def make_strategy(
 
     Raises:
         InputError: there is none.
+        OtherSetup: there is one for the other setup alone.
     """
-    known = FEED_STRATEGIES if is_feed(env) else STRATEGIES
+    known, others = FEED_STRATEGIES, STRATEGIES
+    if not is_feed(env):
+        known, others = others, known
+    if name in others and name not in known:
+        here, there = ("feed", "query") if is_feed(env) else ("query", "feed")
+        raise OtherSetup(
+            f"strategy={name} with setup={here}: it is for setup={there} alone; type that, or "
+            "another strategy"
+        )
     make = known[check_choice("strategy", name, (*known, *beside))]
     acquisition = ACQUISITIONS.get(name)
     if cost is None or not isinstance(acquisition, PerSecond):

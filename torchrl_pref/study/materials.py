@@ -6,12 +6,10 @@ Shapes: N queries, K options per query, D features.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from typing import cast
 
 from torchrl_pref.acquisition.per_second import Cost
 from torchrl_pref.beliefs.base import BeliefBase
-from torchrl_pref.config.checks import PER_SECOND
 from torchrl_pref.config.sections import Plain
 from torchrl_pref.errors import InputError
 from torchrl_pref.groups import load_typed, make
@@ -125,13 +123,14 @@ def make_materials(settings: Plain, raw: QueryPool) -> Materials:
 
 
 def _strategy(settings: Plain) -> str | MakeStrategy:
-    """What chooses the questions: by name, as code of the user's, or with seconds as typed."""
+    """What chooses the questions: by name, with seconds as typed, or as code of the user's."""
     named: str = settings["strategy"]
     if ":" in named:
         return cast(MakeStrategy, load_typed("strategy", named))
-    if named in PER_SECOND:
-        return partial(make_strategy, named, cost=Cost(**settings["cost"]))
-    return named
+    if named == "policy":
+        return named
+    cost = Cost(**settings["cost"])
+    return lambda env: make_strategy(named, env, "policy", cost=cost)
 
 
 def _try_scene(materials: Materials) -> None:

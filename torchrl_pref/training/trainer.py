@@ -26,6 +26,7 @@ from torchrl_pref.checkpoints.restore import (
 )
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
+from torchrl_pref.envs.session import is_feed
 from torchrl_pref.policies.base import Policy
 from torchrl_pref.training.actor_critic import ActorCritic
 from torchrl_pref.training.drawn import DrawnSessions
@@ -123,7 +124,7 @@ class Trainer:
         metrics |= _episode_metrics(batch)
         metrics["train/explained_variance"] = _explained_variance(batch)
         metrics["train/share_asked"] = math.nan  # the query setup offers nothing to skip
-        if isinstance(self.env, FeedEnv):
+        if is_feed(self.env):
             metrics["train/share_asked"] = batch["action"].float().mean().item()
         metrics["time/frames_per_second"] = batch.numel() / (time.perf_counter() - start)
         for name, values in self.progress.history.items():

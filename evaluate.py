@@ -119,6 +119,23 @@ def check(settings: Plain) -> Settings:
             f"policy={settings['policy'].get('make')}: a policy of yours is evaluated as it was "
             "trained; add checkpoint=<its run folder>, or name a strategy by strategy="
         )
+    if typed.was_typed("tau"):
+        return _checked(settings)
+    try:
+        return _checked(settings)
+    except InputError as error:
+        if settings["tau"] != ["noisy", "optimal"]:
+            raise
+        try:
+            checked = _checked({**settings, "tau": ["noisy"]})
+        except InputError:
+            raise error from None
+        print(f"note: here tau=noisy alone, because {error}")
+        return checked
+
+
+def _checked(settings: Plain) -> Settings:
+    """See :func:`check`, once it is known that nothing decides what something else does."""
     checked = check_evaluate_settings(settings)
     typed.refuse_idle_cost(listed(checked["strategy"]))
     for each in tasks_of(checked):

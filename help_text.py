@@ -80,6 +80,8 @@ def _group(group: str, default: str, script: str, said: set[str]) -> str:
         if group == "policy" and (path.stem == "pretrained") != (script == "evaluate"):
             continue  # train.py makes policies, evaluate.py knows ours and those of checkpoints
         keys = keys_of(path)
+        if own := [key for key in keys if key.name.startswith(f"{group}.")]:  # and other sections'
+            keys = [key._replace(name=key.name.removeprefix(f"{group}.")) for key in own]
         named = [key for key in keys if key.name == "name"]
         meaning = named[0].comment if named else " ".join(_top_comment(path).split())
         mark = " (default)" if path.stem == default else ""

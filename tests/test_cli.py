@@ -99,6 +99,14 @@ def test_train_evaluate_and_resume(tmp_path: Path) -> None:
     assert "RL-feed: alignment with 6 held-out humans" in output
 
 
+def test_humans_who_never_err_are_left_out_where_nobody_asked_for_them(tmp_path: Path) -> None:
+    output = run("evaluate.py", "question=weak", *TINY_TASK, f"hydra.run.dir={tmp_path}/run")
+    assert output.startswith("note: here tau=noisy alone, because tau=optimal with question=weak")
+    assert "optimal human" not in (tmp_path / "run" / "tables.txt").read_text()
+    asked_for = run_script("evaluate.py", "question=weak", "tau=[noisy,optimal]", *TINY_TASK)
+    assert asked_for.stderr.startswith("error: tau=optimal with question=weak")
+
+
 def test_resume_is_bit_for_bit(tmp_path: Path) -> None:
     whole, parts = f"hydra.run.dir={tmp_path}/whole", f"hydra.run.dir={tmp_path}/parts"
     run("train.py", "setup=query", *TINY, whole)

@@ -117,7 +117,8 @@ def load_typed(key: str, reference: Any) -> Callable[..., Any]:
     if reference not in _typed:
         raise InputError(
             f"{key}={reference}: a file names code of yours, which is run only if you type it; "
-            f"add {key}={reference} to the command"
+            f"add {key}={reference} to the command, or in Python call "
+            f"torchrl_pref.groups.allow({reference!r}) before"
         )
     return load(f"{key}={reference}", reference)
 

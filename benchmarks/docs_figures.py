@@ -188,6 +188,7 @@ PARTS: dict[str, Part] = {
         25,
         docs_tables.beyond,
     ),
+    "into_package": measured("into_package", "docs/extending.md", 4),
     "batches": measured("batches", "docs/batches.md", 20),
     "answers": measured("answers", "docs/questions.md", 3, "--plot {folder}/answers.png"),
     "quality": Part(

@@ -19,7 +19,7 @@ from torchrl_pref.checkpoints.restore import restore_weights
 from torchrl_pref.config.sections import GroupSection, Settings
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
-from torchrl_pref.envs.session import is_feed
+from torchrl_pref.envs.session import is_feed, refuse_other_setup
 from torchrl_pref.errors import InputError, check_seed
 from torchrl_pref.groups import make
 from torchrl_pref.humans.base import HumanBase
@@ -270,6 +270,7 @@ def make_policy(settings: Settings, env: EnvBase) -> Policy:
     if section.get("start", ...) is None and not is_feed(env):
         section = {**section, "start": settings["objective"]}  # as trained, whatever env rewards
     made: Policy = make("policy", section, env, without=("sample",))
+    refuse_other_setup(f"policy={section.get('make') or section['name']}", made.strategy, env)
     return made
 
 

@@ -1,6 +1,6 @@
 """An acquisition function of your own, asked greedily: the query that samples are most split about.
 
-    python ../../evaluate.py strategy=my_acquisition:most_disputed
+    python ../../evaluate.py setup=query strategy=my_acquisition:most_disputed
 
 Each sample of the belief votes for the answer that it thinks likeliest (query by committee: Dagan
 and Engelson, 1995). It is a baseline to beat: it counts votes, and not how sure a sample is.

@@ -1,6 +1,6 @@
 """A strategy of your own: ask about the two options that look most different, wherever they are.
 
-python ../../evaluate.py strategy=my_strategy:most_different
+python ../../evaluate.py setup=query strategy=my_strategy:most_different
 """
 
 import torch

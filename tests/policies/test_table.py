@@ -9,6 +9,7 @@ from torchrl.envs import TransformedEnv
 from torchrl_pref.checkpoints.restore import restore_weights
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
+from torchrl_pref.envs.session import refuse_other_setup
 from torchrl_pref.errors import InputError
 from torchrl_pref.policies import POLICIES
 from torchrl_pref.policies.base import Policy, PolicyKind
@@ -31,9 +32,11 @@ def test_a_policy_is_for_a_setup_and_refuses_the_other_if_it_has_to(
 def made(name: str, env: QueryEnv | FeedEnv) -> Policy | None:
     """The policy, or None where it is for the other setup."""
     try:
-        return KINDS[name].make(env)
+        policy = KINDS[name].make(env)
+        refuse_other_setup(name, policy.strategy, env)
     except InputError:
         return None
+    return policy
 
 
 @pytest.mark.parametrize(("name", "env_kind"), CASES)

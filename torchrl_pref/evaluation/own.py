@@ -24,7 +24,7 @@ from torchrl_pref.acquisition.per_second import Cost
 from torchrl_pref.config.sections import Settings
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
-from torchrl_pref.envs.session import is_feed
+from torchrl_pref.envs.session import is_feed, refuse_other_setup
 from torchrl_pref.errors import InputError, OtherSetup, check_choice
 from torchrl_pref.evaluation.side_by_side import Entrant
 from torchrl_pref.evaluation.style import is_there
@@ -97,15 +97,6 @@ def make_own(
     return entrants
 
 
-ALONE = {True: ("offer", "n_offered"), False: ("queries", "action_mask")}
-"""What a feed alone shows, and a pool to choose from."""
-
-
-def hidden_from(strategy: TensorDictModuleBase, env: QueryEnv | FeedEnv) -> list[str]:
-    """What a strategy reads that only the other setup shows."""
-    return [key for key in ALONE[not is_feed(env)] if key in strategy.in_keys]
-
-
 def try_own(makers: Mapping[str, Maker], env: QueryEnv | FeedEnv) -> None:
     """Let each strategy decide once, so that one which cannot is refused before anything is run.
 
@@ -118,12 +109,7 @@ def try_own(makers: Mapping[str, Maker], env: QueryEnv | FeedEnv) -> None:
         OtherSetup: it is for the other setup.
     """
     for typed, entrant in zip(makers, make_own(makers, env, 0), strict=True):
-        if unseen := hidden_from(entrant.strategy, env):
-            here, there = ("feed", "query") if is_feed(env) else ("query", "feed")
-            raise OtherSetup(
-                f"strategy={typed} with setup={here}: it reads {unseen[0]}, which setup={there} "
-                "alone shows; type that, or another strategy"
-            )
+        refuse_other_setup(f"strategy={typed}", entrant.strategy, env)
         try:
             with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
                 decided = entrant.strategy(env.reset())

@@ -347,6 +347,16 @@ BAD: dict[str, tuple[str, Callable[[], bytes | str], str]] = {
         "other length",
     ),
     "parquet: cut off": (".parquet", lambda: parquet_bytes(table())[:-30], "cannot be read"),
+    "parquet: cut in half and ended": (
+        ".parquet",
+        lambda: (whole := parquet_bytes(table()))[: len(whole) // 2] + whole[-8:],
+        "cannot be read",
+    ),
+    "csv: a name with a line break": (
+        ".csv",
+        lambda: 'a,"b\x1b[31m\nc"\n1,2\n3,nan\n',
+        "column 'b.*c' holds NaN",
+    ),
     "parquet: 3 billion rows claimed": (
         ".parquet",
         lambda: lying_parquet(3 * 10**9),
@@ -412,6 +422,7 @@ def test_bad_files_are_refused_in_one_line(
     text = str(refused.value)
     assert "x" + suffix in text
     assert len(text) < 1200
+    assert text.isprintable()  # a line break is not
     assert not (tmp_path / RAN).exists()
 
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 import re
+import sys
 from pathlib import Path
 
 import pytest
 import torch
 from PIL import Image
+from recordings import DATASET, write_csv, write_minari
 
 from torchrl_pref.errors import InputError
 from torchrl_pref.pool import QueryPool
@@ -193,10 +195,66 @@ def test_the_command_draws_any_task(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert sheet.read_bytes() == before
 
 
+TYPED = {
+    "gridworld": ["size=3"],
+    "driver": [],
+    "lds": ["released_inputs=true"],
+    "gymnasium": ["id=Pendulum-v1", "length=9", "features=recordings:reach"],
+    "torchrl": ["make=recordings:grid", "length=9", "features=recordings:reach"],
+    "gaussian": ["dimension=3"],
+    "files": ["path=x.csv"],
+    "minari": [f"id={DATASET}"],
+    "my_task:Table": ["steps=9"],
+}
+"""What is typed for each task; code in it is of the folder of the tests."""
+
+
+@pytest.mark.parametrize("name", [*TASKS, "my_task:Table"])
+def test_the_command_draws_every_task(
+    name: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    if name == "files":
+        write_csv(tmp_path / "x.csv", 20)
+    if name == "minari":
+        monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+        write_minari(tmp_path)
+    main([name, *TYPED[name], "--queries", "2"])
+    sheet = f"{name.removeprefix('my_task:')}.png"
+    assert capsys.readouterr().out == f"{sheet}\n"
+    with Image.open(sheet) as image:
+        assert image.width > 300
+        assert len(image.convert("RGB").getcolors(2**20) or ()) > 9  # something is drawn
+
+
+def test_code_is_looked_for_in_the_present_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    Path("brought.py").write_text("from recordings import grid as world, reach as ends\n")
+    main(["torchrl", "make=brought:world", "features=brought:ends", "length=5", "--queries", "1"])
+    assert Path("torchrl.png").exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["grid"], "expected one of gridworld, driver"),
+        (["grid"], "grid: no task; expected one of gridworld, driver"),
+        (["my_task:Chair"], "my_task.py has no Chair"),
+        (["no_such_module:Table"], "error: no_such_module:Table: no module no_such_module"),
+        (["my_task:Table", "size=3"], "size=3: no setting of my_task:Table; expected steps=…"),
+        (["my_task:Table", "steps=[]"], "error: my_task:Table: its first trajectories fail (Type"),
+        (["recordings:grid"], "recordings:grid: makes a Gridworld; expected a Task"),
+        (["torchrl"], "error: make=null: expected a function of yours"),
+        (["torchrl"], "type make=<module>:"),
+        (["torchrl", "make=3"], "error: make=3: expected <module>:<name>"),
+        (["gymnasium", "id=Pendulum-v1"], "type features=<module>:"),
+        (["gymnasium", "features=recordings:none"], "recordings.py has no none"),
+        (["files"], "type path="),
         (["gridworld", "width=3"], "width=3: no setting of gridworld; expected size=…, length=…"),
         (["driver", "size=3"], "no setting of driver; expected none"),
         (["gridworld", "size"], "no setting of gridworld"),

@@ -142,7 +142,7 @@ def test_images_are_named_by_texts(clip: list[object], tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"path": None}, "task.path"),
+        ({"path": None}, "type path="),
         ({"columns": "speed"}, "expected a list"),
         ({"columns": ["speed", "speed"]}, "one twice"),
         ({"columns": ["speed", "weight"]}, "no column 'weight'"),

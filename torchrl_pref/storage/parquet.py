@@ -67,7 +67,7 @@ def _chosen(schema: Any, choice: Choice) -> list[str]:
         elif not (types.is_integer(kind) or types.is_floating(kind) or types.is_boolean(kind)):
             raise Refused(
                 f"column {name!r} holds {kind!s:.40}; expected numbers; name those that do by "
-                "task.columns=[…]"
+                "columns=[…]"
             )
     return chosen
 

@@ -111,7 +111,7 @@ def _checked(columns: Columns, choice: Choice) -> Columns:
         if values.dtype.kind not in "biuf":
             raise Refused(
                 f"column {name!r} holds {values.dtype}; expected numbers; name those that do by "
-                "task.columns=[…]"
+                "columns=[…]"
             )
         checked[name] = values.astype(np.float64, copy=False)
         bad = np.argwhere(~np.isfinite(checked[name]))
@@ -159,8 +159,8 @@ def _csv(path: str, limit: int, choice: Choice) -> Columns:
                 except ValueError:
                     raise Refused(
                         f"line {lines.line_num} has {cells[place]!r:.40} in column {name!r:.80}; "
-                        "expected a number; mend it, or name those of numbers by task.columns=[…], "
-                        "one of images by task.images="
+                        "expected a number; mend it, or name those of numbers by columns=[…], "
+                        "one of images by images="
                     ) from None
             if named_in is not None:
                 named.append(room.text(header[named_in], cells[named_in].strip()))

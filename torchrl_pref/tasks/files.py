@@ -42,7 +42,7 @@ class FilesTask(RecordedTask):
         images: str | None = None,
     ) -> None:
         if path is None:
-            raise InputError("path=null: expected the file of the trajectories; type task.path=…")
+            raise InputError("path=null: expected the file of the trajectories; type path=…")
         _check_columns(columns, images)
         found = read_columns(path, columns, images)
         self._pictures = None if images is None else _pictures(Path(path), found.pop(images))

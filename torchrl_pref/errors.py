@@ -18,7 +18,7 @@ UNPRINTABLE = re.compile(
 """What a terminal would act upon, or cannot write; other blanks may be of a path, and stay."""
 
 
-def printable(text: str) -> str:
+def in_one_line(text: str) -> str:
     """A text that may quote anything, in one line that can be printed."""
     return UNPRINTABLE.sub("?", re.sub(r"\s*\n\s*", " ", text).strip())
 
@@ -32,7 +32,7 @@ class InputError(ValueError):
     """
 
     def __init__(self, message: str) -> None:
-        super().__init__(printable(message))
+        super().__init__(in_one_line(message))
 
 
 class OtherSetup(InputError):
@@ -183,7 +183,7 @@ def check_choice(name: str, value: Any, choices: tuple[str, ...]) -> str:
 def one_line(error: Exception) -> str:
     """What an error says, in one line that can be printed, without the middle of what is too
     long."""
-    text = printable(str(error))
+    text = in_one_line(str(error))
     return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} … {text[-LONGEST // 2 :]}"
 
 

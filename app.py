@@ -112,7 +112,7 @@ def allow_typed(settings: Plain) -> None:
     """Let the code be imported that the user typed, as in ``policy=mine:make``."""
     typed_by_user = typed.typed_code()
     if typed_by_user:
-        from torchrl_pref.groups import allow
+        from torchrl_pref.typed_code import allow
 
         for key in typed_by_user:
             group, _, name = key.partition(".")

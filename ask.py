@@ -71,7 +71,7 @@ def check(settings: Plain) -> Plain:
     typed.refuse_idle_cost([settings["strategy"]])
     app.allow_typed(settings)
     if code and typed.was_typed("strategy"):
-        from torchrl_pref.groups import allow
+        from torchrl_pref.typed_code import allow
 
         allow(settings["strategy"])
     elif settings["ui"] == "browser":

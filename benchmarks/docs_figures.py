@@ -104,6 +104,7 @@ SWEEP = "hydra.sweep.dir={folder}/sweep"
 TWO = "hydra/launcher=joblib hydra.launcher.n_jobs=2"
 CELLS = [f"{setup}-{tau}" for setup in ("feed", "query") for tau in ("noisy", "optimal")]
 SHEET = "python -m torchrl_pref.tasks {task} --animate --out {{folder}}/{task}.png -> {task}.gif"
+PENDULUM = "python examples/pendulum_file.py {folder}/pendulum.csv 2000 -> pendulum.csv"
 START = "policy.start=information_gain training.learning_rate=0.01 training.updates=200"
 
 PARTS: dict[str, Part] = {
@@ -115,8 +116,13 @@ PARTS: dict[str, Part] = {
     ),
     "gallery": Part(
         "docs/gallery.md",
-        tuple(SHEET.format(task=task) for task in GALLERY),
-        0.5,
+        (
+            *(SHEET.format(task=task) for task in GALLERY),
+            PENDULUM,
+            "python -m torchrl_pref.tasks files path={folder}/pendulum.csv "
+            "--out {folder}/files.png -> files.png",
+        ),
+        1,
         docs_tables.gallery,
     ),
     "heldout": Part(
@@ -166,7 +172,7 @@ PARTS: dict[str, Part] = {
         (
             f"{HELDOUT} {SMALLER} tasks=[driver,lds,gymnasium] hydra.run.dir={{folder}}/tasks "
             f"-> tasks/{CSV}",
-            "python examples/pendulum_file.py {folder}/pendulum.csv 2000 -> pendulum.csv",
+            PENDULUM,
             f"{HELDOUT} {SMALLER} task=files task.path={{folder}}/pendulum.csv "
             f"hydra.run.dir={{folder}}/files -> files/{CSV}",
         ),

@@ -8,7 +8,7 @@ import csv
 import json
 import shutil
 from collections.abc import Callable
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,7 @@ DOCS = Path(__file__).resolve().parents[1] / "docs"
 TAUS = ("noisy", "optimal")
 
 GALLERY = ("gridworld", "driver", "lds", "gymnasium")
+"""Tasks that are shown in motion."""
 
 Rows = list[dict[str, str]]
 
@@ -101,9 +102,8 @@ def pretrained(folder: Path) -> dict[str, str]:
 def gallery(folder: Path) -> dict[str, str]:
     """The pictures of the gallery."""
     (DOCS / "gallery").mkdir(exist_ok=True)
-    for task in GALLERY:
-        for kind in ("png", "gif"):
-            shutil.copy(folder / f"{task}.{kind}", DOCS / "gallery")
+    for path in chain(folder.glob("*.png"), folder.glob("*.gif")):
+        shutil.copy(path, DOCS / "gallery")
     return {}
 
 

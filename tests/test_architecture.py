@@ -15,6 +15,7 @@ ORDER = [
     "processes",
     "storage",
     "config",
+    "typed_code",
     "questions",
     "acquisition",
     "beliefs",

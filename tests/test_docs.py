@@ -229,6 +229,20 @@ def test_the_gallery_shows_a_task(name: str) -> None:
         assert feature in section
 
 
+def test_the_gallery_shows_a_file() -> None:
+    section = (ROOT / "docs" / "gallery.md").read_text().partition("`task=files`")[2]
+    assert "![" in section
+    assert "(gallery/files.png)" in section
+    assert (ROOT / "docs" / "gallery" / "files.png").stat().st_size < 200_000
+    example = (ROOT / "examples" / "pendulum_file.py").read_text()
+    features = re.search(r"^FEATURES = (.*)$", example, re.M)
+    assert features is not None
+    for feature in re.findall(r'"(\w+)"', features[1]):
+        assert f"| {feature} |" in section
+    made = [line.rpartition(" -> ")[2] for line in docs_figures.PARTS["gallery"].commands]
+    assert made[-2:] == ["pendulum.csv", "files.png"]
+
+
 def test_a_cell_of_the_protocol_is_a_table() -> None:
     """Two pools of five humans: the policy is .1 ahead of greedy, which faces three of them."""
     entries = []

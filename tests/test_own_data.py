@@ -14,8 +14,9 @@ from recordings import write_csv
 from test_extending import ROOT, SMALL, run
 
 from torchrl_pref.errors import InputError
-from torchrl_pref.groups import allow, make
+from torchrl_pref.groups import make
 from torchrl_pref.pool import QueryPool
+from torchrl_pref.typed_code import allow
 
 MINE = """
 import torch
@@ -93,6 +94,7 @@ def settings_of(task: str, **typed: object) -> dict[str, Any]:
         ("gymnasium", {"id": "CartPole-v1"}, "task.features=<module>:<its name>"),
         ("gymnasium", {"id": "mine:Thing-v0"}, "task.id='mine:Thing-v0': expected"),
         ("gymnasium", {"length": "many"}, "task.length='many': expected a whole number"),
+        ("gymnasium", {"length": 1}, "set task.length=2 or more"),
         ("gymnasium", {"features": "mine:nothing"}, "has no nothing"),
         ("gymnasium", {"features": [1]}, "expected <module>:<name>"),
         ("gymnasium", {"policy": "mine:untyped"}, "run only if you type it"),

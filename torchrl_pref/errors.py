@@ -12,9 +12,27 @@ from typing import Any
 LONGEST = 1200
 """Letters of an error that are shown."""
 
+UNPRINTABLE = re.compile(
+    r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
+)
+"""What a terminal would act upon, or cannot write; other blanks may be of a path, and stay."""
+
+
+def in_one_line(text: str) -> str:
+    """A text that may quote anything, in one line that can be printed."""
+    return UNPRINTABLE.sub("?", re.sub(r"\s*\n\s*", " ", text).strip())
+
 
 class InputError(ValueError):
-    """Input that cannot be used. The message is one line, written for the person who gave it."""
+    """Input that cannot be used. The message is one line, written for the person who gave it.
+
+    Args:
+        message: what came, what was expected and how to mend it; what it quotes of a file or of a
+            library may hold anything, and is made printable here.
+    """
+
+    def __init__(self, message: str) -> None:
+        super().__init__(in_one_line(message))
 
 
 class OtherSetup(InputError):
@@ -163,10 +181,9 @@ def check_choice(name: str, value: Any, choices: tuple[str, ...]) -> str:
 
 
 def one_line(error: Exception) -> str:
-    """What an error says, without line breaks, what a terminal would act upon, and the middle of
-    what is too long; other blanks may be of a path, and stay."""
-    text = re.sub(r"\s*\n\s*", " ", str(error)).strip()
-    text = re.sub(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]", "?", text)
+    """What an error says, in one line that can be printed, without the middle of what is too
+    long."""
+    text = in_one_line(str(error))
     return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} … {text[-LONGEST // 2 :]}"
 
 

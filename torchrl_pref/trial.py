@@ -9,11 +9,12 @@ from __future__ import annotations
 from torchrl_pref.build import ANSWERING, refuse_own_pools, weigh_steps
 from torchrl_pref.config.sections import Settings
 from torchrl_pref.errors import InputError
-from torchrl_pref.groups import find, make, where
+from torchrl_pref.groups import find, make
 from torchrl_pref.pool import QueryPool
 from torchrl_pref.questions.base import Question
 from torchrl_pref.questions.responses import model_of
 from torchrl_pref.tasks.base import make_pool
+from torchrl_pref.typed_code import where
 
 
 def check_groups(settings: Settings) -> None:

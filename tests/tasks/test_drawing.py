@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import os
 import re
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 import torch
-from PIL import Image
+from PIL import Image, ImageChops, ImageDraw
+from recordings import DATASET, write_csv, write_minari
 
 from torchrl_pref.errors import InputError
 from torchrl_pref.pool import QueryPool
@@ -18,7 +21,7 @@ from torchrl_pref.tasks.base import make_pool
 from torchrl_pref.tasks.drawing import save_animation, save_picture
 from torchrl_pref.tasks.gridworld import WALKER, GridworldTask
 from torchrl_pref.tasks.scene import Disc, Label, Line, Patch, Picture, Scene
-from torchrl_pref.tasks.sheet import columns_of, contact_sheet, widened
+from torchrl_pref.tasks.sheet import columns_of, contact_sheet, sheet, widened
 
 RED, GREEN, BLUE = "#ff0000", "#00ff00", "#0000ff"
 
@@ -76,6 +79,79 @@ def test_every_shape_is_drawn_in_its_order(tmp_path: Path) -> None:
             save_picture(Scene((0, 0), (2, 1), still, (frame,)), tmp_path / f"{name}.png")
             with Image.open(tmp_path / f"{name}.png") as image:
                 assert colour_at(image, 0.5, 0.5) == expected
+
+
+def with_disc(path: Path, size: tuple[int, int], colours: Sequence[str]) -> Picture:
+    """An image file with a blue disc, 40 pixels wide, on a ground of a colour for each frame."""
+    frames = []
+    for colour in colours:
+        frames.append(Image.new("RGB", size, colour))
+        x, y = size[0] // 2, size[1] // 2
+        ImageDraw.Draw(frames[-1]).ellipse((x - 20, y - 20, x + 20, y + 20), BLUE)
+    frames[0].save(path, save_all=len(frames) > 1, append_images=frames[1:], duration=50)
+    return Picture(str(path))
+
+
+def of_image(picture: Picture) -> Scene:
+    """As the files' task has it."""
+    return Scene((0.0, 0.0), (1.0, 1.0), (), ((picture,),))
+
+
+def blue_size(image: Image.Image) -> tuple[int, int]:
+    """Width and height of what is blue."""
+    red, _, blue = image.convert("RGB").split()
+    shown = ImageChops.subtract(blue, red).point(lambda value: 255 * (value > 127))
+    left, top, right, bottom = shown.getbbox() or (0, 0, 0, 0)
+    return right - left, bottom - top
+
+
+@pytest.mark.parametrize("size", [(320, 80), (80, 320), (50, 50)])
+def test_images_keep_their_shape(size: tuple[int, int], tmp_path: Path) -> None:
+    wide = of_image(with_disc(tmp_path / "wide.png", (320, 80), ["white"]))
+    scene = of_image(with_disc(tmp_path / "disc.png", size, ["white"]))
+    ground = Scene((0, 0), (3, 1), (*scene.frames[0], Label((0, 0), "A")), ((),))
+    for scenes in (scene, [scene, scene], [ground]):
+        save_picture(scenes, tmp_path / "a.png")
+        save_animation(scenes, tmp_path / "a.gif")
+        for name in ("a.png", "a.gif"):
+            with Image.open(tmp_path / name) as image:
+                if not isinstance(scenes, Scene):
+                    image = image.crop((0, 0, image.width // len(scenes), image.height))
+                across, up = blue_size(image)
+                assert across > 15
+                assert abs(across - up) <= 2
+    figure = sheet([[scene], [wide]], [[[0.0]], [[0.0]]], ["speed"])
+    places = [axes.images[0] for axes in figure.axes if axes.images]
+    for (across, up), drawn in zip((size, (320, 80)), places, strict=True):
+        box = drawn.get_window_extent()
+        assert abs(box.width / box.height / (across / up) - 1) < 1e-6
+        assert drawn.axes is not None
+        assert drawn.axes.bbox.padded(1e-6).get_points().tolist()[0] <= box.get_points().tolist()[0]
+
+
+def test_the_shape_of_a_panel_is_that_of_its_images(tmp_path: Path) -> None:
+    wide = of_image(with_disc(tmp_path / "wide.png", (320, 80), ["white"]))
+    save_picture(wide, tmp_path / "a.png")
+    with Image.open(tmp_path / "a.png") as image:
+        assert 3.5 < image.width / image.height < 4
+        assert blue_size(image)[0] > image.width / 10  # as large as there is room
+
+
+def test_clips_move(tmp_path: Path) -> None:
+    """A GIF of three frames beside one of two, which stays at its end; a sheet shows the last."""
+    clip = of_image(with_disc(tmp_path / "clip.gif", (80, 80), [RED, GREEN, "white"]))
+    short = of_image(with_disc(tmp_path / "short.gif", (80, 80), [GREEN, RED]))
+    save_animation([clip, short], tmp_path / "a.gif")
+    with Image.open(tmp_path / "a.gif") as image:
+        assert image.n_frames == 3
+        for moment, grounds in enumerate(
+            [((1, 0, 0), (0, 1, 0)), ((0, 1, 0), (1, 0, 0)), ((1, 1, 1), (1, 0, 0))]
+        ):
+            image.seek(moment)
+            assert (colour_at(image, 0.1, 0.8), colour_at(image, 0.9, 0.8)) == grounds
+    save_picture(short, tmp_path / "a.png")
+    with Image.open(tmp_path / "a.png") as image:
+        assert colour_at(image, 0.1, 0.8) == (1, 0, 0)
 
 
 def test_svg_holds_the_words_and_is_the_same_again(tmp_path: Path) -> None:
@@ -183,20 +259,76 @@ def test_a_grid_is_filled() -> None:
 
 
 def test_the_command_draws_any_task(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    sheet = tmp_path / "sheet.png"
-    main(["gridworld", "size=3", "length=4", "--queries", "2", "--animate", "--out", str(sheet)])
-    assert capsys.readouterr().out.split() == [str(sheet), str(tmp_path / "sheet.gif")]
+    path = tmp_path / "sheet.png"
+    main(["gridworld", "size=3", "length=4", "--queries", "2", "--animate", "--out", str(path)])
+    assert capsys.readouterr().out.split() == [str(path), str(tmp_path / "sheet.gif")]
     with Image.open(tmp_path / "sheet.gif") as image:
         assert image.n_frames == 4
-    before = sheet.read_bytes()
-    main(["gridworld", "size=3", "length=4", "--queries", "2", "--out", str(sheet)])
-    assert sheet.read_bytes() == before
+    before = path.read_bytes()
+    main(["gridworld", "size=3", "length=4", "--queries", "2", "--out", str(path)])
+    assert path.read_bytes() == before
+
+
+TYPED = {
+    "gridworld": ["size=3"],
+    "driver": [],
+    "lds": ["released_inputs=true"],
+    "gymnasium": ["id=Pendulum-v1", "length=9", "features=recordings:reach"],
+    "torchrl": ["make=recordings:grid", "length=9", "features=recordings:reach"],
+    "gaussian": ["dimension=3"],
+    "files": ["path=x.csv"],
+    "minari": [f"id={DATASET}"],
+    "my_task:Table": ["steps=9"],
+}
+"""What is typed for each task; code in it is of the folder of the tests."""
+
+
+@pytest.mark.parametrize("name", [*TASKS, "my_task:Table"])
+def test_the_command_draws_every_task(
+    name: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    if name == "files":
+        write_csv(tmp_path / "x.csv", 20)
+    if name == "minari":
+        monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+        write_minari(tmp_path)
+    main([name, *TYPED[name], "--queries", "2"])
+    path = f"{name.removeprefix('my_task:')}.png"
+    assert capsys.readouterr().out == f"{path}\n"
+    with Image.open(path) as image:
+        assert image.width > 300
+        assert len(image.convert("RGB").getcolors(2**20) or ()) > 9  # something is drawn
+
+
+def test_code_is_looked_for_in_the_present_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    Path("brought.py").write_text("from recordings import grid as world, reach as ends\n")
+    main(["torchrl", "make=brought:world", "features=brought:ends", "length=5", "--queries", "1"])
+    assert Path("torchrl.png").exists()
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["grid"], "expected one of gridworld, driver"),
+        (["grid"], "grid: no task; expected one of gridworld, driver"),
+        (["my_task:Chair"], "my_task.py has no Chair"),
+        (["no_such_module:Table"], "error: no_such_module:Table: no module no_such_module"),
+        (["my_task:Table", "size=3"], "size=3: no setting of my_task:Table; expected steps=…"),
+        (["my_task:Table", "steps=[]"], "error: my_task:Table: its first trajectories fail (Type"),
+        (["recordings:grid"], "recordings:grid: makes a Gridworld; expected a Task"),
+        (["torchrl"], "error: make=null: expected a function of yours"),
+        (["torchrl"], "type make=<module>:"),
+        (["torchrl", "make=3"], "error: make=3: expected <module>:<name>"),
+        (["gymnasium", "id=Pendulum-v1"], "type features=<module>:"),
+        (["gymnasium", "features=recordings:none"], "recordings.py has no none"),
+        (["files"], "type path="),
         (["gridworld", "width=3"], "width=3: no setting of gridworld; expected size=…, length=…"),
         (["driver", "size=3"], "no setting of driver; expected none"),
         (["gridworld", "size"], "no setting of gridworld"),

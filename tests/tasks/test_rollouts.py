@@ -127,8 +127,8 @@ def broken(observations: Tensor, actions: Tensor, alive: Tensor) -> Tensor:
     ("given", "message"),
     [
         ({"id": "NoSuchThing-v0"}, "cannot be made"),
-        ({"id": "os:Thing-v0"}, "task.make=<module>"),
-        ({"id": "CartPole-v1"}, "task.features=<module>"),
+        ({"id": "os:Thing-v0"}, "type make=<module>"),
+        ({"id": "CartPole-v1"}, "type features=<module>"),
         ({"id": "Blackjack-v1"}, "expected observations of Box"),
         ({"length": 1}, "length=1"),
         ({"features": broken}, "no such column"),

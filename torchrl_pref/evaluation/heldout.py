@@ -32,9 +32,10 @@ from torchrl_pref.evaluation.heldout_pool import (
     try_job,
 )
 from torchrl_pref.evaluation.records import Records
-from torchrl_pref.groups import OWN, TABLES, allow, allowed, make
+from torchrl_pref.groups import OWN, TABLES, make
 from torchrl_pref.processes import spawning
 from torchrl_pref.tasks.base import Task
+from torchrl_pref.typed_code import allow, allowed
 
 POOLS, BALANCED_POOLS = 10, 3
 

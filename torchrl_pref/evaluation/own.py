@@ -28,8 +28,8 @@ from torchrl_pref.envs.session import is_feed, refuse_other_setup
 from torchrl_pref.errors import InputError, OtherSetup, check_choice
 from torchrl_pref.evaluation.side_by_side import Entrant
 from torchrl_pref.evaluation.style import is_there
-from torchrl_pref.groups import load, where
 from torchrl_pref.strategies import FEED_STRATEGIES, STRATEGIES, make_strategy
+from torchrl_pref.typed_code import load, where
 
 Maker = Callable[[QueryEnv | FeedEnv], TensorDictModuleBase]
 

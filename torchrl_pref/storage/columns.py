@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from typing import Any, NamedTuple, TypeAlias
@@ -14,7 +15,11 @@ Columns: TypeAlias = dict[str, "np.ndarray[Any, Any]"]
 """By name, numbers or texts (N) or (N K)."""
 
 RATIO, ALWAYS = 100, 2**26
-"""A file may unpack to so many times its size, and always to so many bytes."""
+"""What is read may take so many times the file's size, and always so many bytes."""
+
+VALUE, TEXT = 16, 200
+"""Bytes of a number, or of where a text is: twice 8, as what is read is copied once, to be put
+together; and what is kept of another text beside its letters, to find it again."""
 
 ARRAY = "features"
 NAMES = "feature_names"
@@ -30,7 +35,7 @@ class Refused(Exception):
 
 
 class Room:
-    """How many bytes the columns of a file may still take, all together, as float64.
+    """How many bytes the columns of a file may still take, all together.
 
     Args:
         limit: of all.
@@ -38,19 +43,37 @@ class Room:
 
     def __init__(self, limit: int) -> None:
         self.limit, self._taken = limit, 0
+        self._texts: dict[str, str] = {}
 
     def take(self, name: str, count: int) -> None:
-        """Make room for so many numbers.
+        """Make room for a column of so many numbers, or texts that are kept elsewhere.
 
         Raises:
             Refused: there is none.
         """
-        self._taken += 8 * count
+        self.take_bytes(f"column {name!r:.80} of {count:,} values", VALUE * count)
+
+    def text(self, name: str, text: str) -> str:
+        """A text of a column, which takes room once, however often it comes.
+
+        Raises:
+            Refused: there is none.
+        """
+        if text not in self._texts:
+            self.take_bytes(f"the texts of column {name!r:.80}", sys.getsizeof(text) + TEXT)
+        return self._texts.setdefault(text, text)
+
+    def take_bytes(self, what: str, size: int) -> None:
+        """Make room for something else of a file.
+
+        Raises:
+            Refused: there is none.
+        """
+        self._taken += size
         if self._taken > self.limit:
             raise Refused(
-                f"with array {name!r:.80} of {count:,} numbers it would take "
-                f"{self._taken / 1e6:.0f} MB; expected at most {self.limit / 1e6:.0f} MB from a "
-                "file of its size; leave some out"
+                f"with {what} it would take {self._taken / 1e6:.0f} MB; expected at most "
+                f"{self.limit / 1e6:.0f} MB from a file of its size; leave some out"
             )
 
 

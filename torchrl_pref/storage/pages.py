@@ -26,8 +26,9 @@ MAX_FIELD = 100
 """Numbers of fields; a reader that counts in 16 bits would take larger ones for others."""
 
 
-def check_pages(path: str, columns: Iterable[tuple[int, int]], limit: int) -> None:
-    """Refuse columns whose pages unpack to more than a limit, all together.
+def check_pages(path: str, columns: Iterable[tuple[int, int]], limit: int) -> int:
+    """Refuse columns whose pages unpack to more than a limit, all together; else, to how many
+    bytes they do.
 
     Args:
         path: of the Parquet file.
@@ -51,6 +52,7 @@ def check_pages(path: str, columns: Iterable[tuple[int, int]], limit: int) -> No
                         f"has pages that unpack to {total / 1e6:.0f} MB or more; expected at most "
                         f"{limit / 1e6:.0f} MB from a file of its size"
                     )
+    return total
 
 
 def _sizes(data: mmap.mmap, place: int) -> tuple[int, int, int]:

@@ -9,7 +9,9 @@ A column holds one number for each of N trajectories, or K for each of N queries
   an entry of the metadata in Safetensors, with commas between them.
 
 Nothing is unpickled. What a header claims is held against the bytes that are there before memory
-is taken for it: a file of n bytes unpacks to at most 100 n, or 64 MiB where that is more.
+is taken for it: a file of n bytes takes at most 100 n, or 64 MiB where that is more, and that is
+with all texts, and with the copy by which a task puts columns together. A CSV takes less, whatever
+is in it, as each cell of it has two letters or more.
 """
 
 from __future__ import annotations
@@ -67,7 +69,7 @@ def read_columns(
             f"{path}: a file of {size / 2**30:.1f} GiB; expected at most {MAX_FILE // 2**30} GiB; "
             "leave columns or trajectories out"
         )
-    choice, limit = Choice(wanted, texts), min(MAX_FILE, max(ALWAYS, RATIO * size))
+    choice, limit = Choice(wanted, texts), min(2 * MAX_FILE, max(ALWAYS, RATIO * size))
     try:
         return _checked(READERS[suffix](str(path), limit, choice), choice)
     except ImportError as error:
@@ -109,9 +111,9 @@ def _checked(columns: Columns, choice: Choice) -> Columns:
         if values.dtype.kind not in "biuf":
             raise Refused(
                 f"column {name!r} holds {values.dtype}; expected numbers; name those that do by "
-                "task.columns=[…]"
+                "columns=[…]"
             )
-        checked[name] = values.astype(np.float64)
+        checked[name] = values.astype(np.float64, copy=False)
         bad = np.argwhere(~np.isfinite(checked[name]))
         if len(bad):
             raise Refused(
@@ -123,7 +125,7 @@ def _checked(columns: Columns, choice: Choice) -> Columns:
 
 def _csv(path: str, limit: int, choice: Choice) -> Columns:
     """Columns of a CSV."""
-    numbers, named = array("d"), []
+    numbers, named, room = array("d"), [], Room(limit)
     with open(path, encoding="utf-8-sig", newline="") as file:
         lines = csv.reader(_lines(file), strict=True)
         header = [name.strip() for name in next(lines, [])]
@@ -157,11 +159,11 @@ def _csv(path: str, limit: int, choice: Choice) -> Columns:
                 except ValueError:
                     raise Refused(
                         f"line {lines.line_num} has {cells[place]!r:.40} in column {name!r:.80}; "
-                        "expected a number; mend it, or name those of numbers by task.columns=[…], "
-                        "one of images by task.images="
+                        "expected a number; mend it, or name those of numbers by columns=[…], "
+                        "one of images by images="
                     ) from None
             if named_in is not None:
-                named.append(cells[named_in].strip())
+                named.append(room.text(header[named_in], cells[named_in].strip()))
     table = np.array(numbers).reshape(-1, len(chosen)) if chosen else np.empty((len(named), 0))
     columns: Columns = {name: table[:, place] for place, name in enumerate(chosen)}
     if choice.texts is not None:
@@ -212,7 +214,13 @@ def _npz(path: str, limit: int, choice: Choice) -> Columns:
         room = Room(limit)
 
         def load(name: str) -> np.ndarray[Any, Any]:
-            return _array(archive, members[name], name, room)
+            values = _array(archive, members[name], name, room)
+            if values.dtype.kind != "U":
+                return values.astype(np.float64, copy=False)
+            if name != choice.texts:
+                return values
+            kept = [room.text(name, str(text)) for text in values.flat]
+            return np.array(kept, object).reshape(values.shape)
 
         labels = load(NAMES).tolist() if NAMES in members else None
         return of_arrays([name for name in members if name != NAMES], load, labels, choice)
@@ -250,6 +258,8 @@ def _array(
                 "bytes are there; save it again"
             )
     room.take(name, math.prod(shape))
+    if dtype.kind == "U":  # as long as the longest of them, each
+        room.take_bytes(f"the texts of column {name!r:.80}", member.file_size)
     with archive.open(member) as file:
         values: np.ndarray[Any, Any] = np.lib.format.read_array(file, allow_pickle=False)
         file.read(1)  # the end, where the checksum is compared

@@ -12,7 +12,7 @@ from torchrl_pref.acquisition.per_second import Cost
 from torchrl_pref.beliefs.base import BeliefBase
 from torchrl_pref.config.sections import Plain
 from torchrl_pref.errors import InputError
-from torchrl_pref.groups import load_typed, make
+from torchrl_pref.groups import make
 from torchrl_pref.pool import Normalizer, QueryPool
 from torchrl_pref.problem import solve_tau
 from torchrl_pref.questions.base import Question
@@ -22,6 +22,7 @@ from torchrl_pref.session import Session
 from torchrl_pref.strategies import MakeStrategy, make_strategy
 from torchrl_pref.tasks.base import Task, feature_bars, make_pool
 from torchrl_pref.tasks.scene import Scene
+from torchrl_pref.typed_code import load_typed
 
 
 @dataclass(frozen=True)

@@ -90,4 +90,5 @@ def feature_bars(names: tuple[str, ...], features: Tensor, sizes: Tensor) -> Sce
         bars.append(Patch(((0.0, low), (size, low), (size, high), (0.0, high)), "#4477aa"))
         bars.append(Label((0.0, -row - 0.2), f"{name}: {value:.3g}"))
     reach = max(1e-9, float(sizes.abs().max())) * 1.1
-    return Scene((-reach, -float(len(names))), (reach, 0.0), (), (tuple(bars),), equal=False)
+    # As much room above the first name as below the last bar.
+    return Scene((-reach, -float(len(names))), (reach, 0.2), (), (tuple(bars),), equal=False)

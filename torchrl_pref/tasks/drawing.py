@@ -22,6 +22,7 @@ from PIL import Image
 
 from torchrl_pref.errors import InputError
 from torchrl_pref.storage.writing import replacing
+from torchrl_pref.tasks.images import Images, frame_count, shaped
 from torchrl_pref.tasks.scene import Disc, Label, Line, Patch, Picture, Point, Scene, Shape, corners
 
 Scenes: TypeAlias = Scene | Sequence[Scene]
@@ -61,9 +62,10 @@ def save_picture(scenes: Scenes, path: str | Path) -> None:
 
 def picture_of(scenes: Scenes) -> Figure:
     """A picture of whole trajectories, see :func:`save_picture`."""
-    figure, panels = row_of(scenes)
+    images = Images()
+    figure, panels = row_of(scenes, images)
     for axes, scene in panels:
-        draw(axes, scene.frames[-1], scene)
+        draw_end(axes, scene, images)
     return figure
 
 
@@ -72,33 +74,48 @@ def save_animation(scenes: Scenes, path: str | Path) -> None:
 
     Args:
         scenes: of one trajectory, or of K options, 8 at most; one that is shorter stays at its end.
-        path: ends in ``.gif``. Of more than 60 frames an even choice is shown.
+        path: ends in ``.gif``. Of more than 60 frames an even choice is shown, of animated images
+            as of scenes.
 
     Raises:
         InputError: there are too many options, an image of theirs cannot be read, or the file has
             another ending or cannot be written.
     """
     path = checked(path, ".gif")
-    figure, panels = row_of(scenes)
-    length = max(len(scene.frames) for _, scene in panels)
+    shown, seen = Images(), []
+    figure, panels = row_of(scenes, shown)
+    length = max(frame_count(scene, shown) for _, scene in panels)
     count = min(length, MOST_FRAMES)
-    images = []
     for number in range(count):
         step = round(number * (length - 1) / max(1, count - 1))
         drawn: list[Artist] = []
         for axes, scene in panels:
-            drawn += draw(axes, scene.frames[min(step, len(scene.frames) - 1)], scene)
-        images.append(as_image(figure))
+            frame = scene.frames[min(step, len(scene.frames) - 1)]
+            drawn += draw(axes, frame, scene, shown, step)
+        seen.append(as_image(figure))
         for artist in drawn:
             artist.remove()
-    # One choice of colours for all frames, or the ground would flicker.
-    palette = images[-1].quantize(128, dither=Image.Dither.NONE)
-    first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
+    palette = palette_of(seen)
+    first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in seen)
     each = [min(400, round(1000 * SECONDS / count))] * (count - 1)
     durations = [*each, round(1000 * LAST)]
     file = io.BytesIO()
     first.save(file, "GIF", save_all=True, append_images=others, duration=durations, loop=0)
     write(path, file)
+
+
+def palette_of(images: Sequence[Image.Image]) -> Image.Image:
+    """One choice of colours for frames of one size, or the ground would flicker: by all of the last
+    one, and the others made small."""
+    *others, last = images
+    small = max(1, last.width // 4), max(1, last.height // 4)
+    rows = -(-len(others) // 4)
+    whole = Image.new("RGB", (last.width, last.height + rows * small[1]), "white")
+    whole.paste(last)
+    for number, image in enumerate(others):
+        place = (number % 4 * small[0], last.height + number // 4 * small[1])
+        whole.paste(image.resize(small, Image.Resampling.NEAREST), place)
+    return whole.quantize(128, dither=Image.Dither.NONE)
 
 
 def checked(path: str | Path, *endings: str) -> Path:
@@ -138,7 +155,7 @@ def write(path: Path, file: io.BytesIO) -> None:
         ) from None
 
 
-def row_of(scenes: Scenes) -> tuple[Figure, list[tuple[Axes, Scene]]]:
+def row_of(scenes: Scenes, images: Images) -> tuple[Figure, list[tuple[Axes, Scene]]]:
     """A figure with a panel for each option, at one scale, and in it what does not move.
 
     Raises:
@@ -147,6 +164,7 @@ def row_of(scenes: Scenes) -> tuple[Figure, list[tuple[Axes, Scene]]]:
     options = [scenes] if isinstance(scenes, Scene) else list(scenes)
     if not 1 <= len(options) <= len(LETTERS):
         raise InputError(f"{len(options)} trajectories: expected 1 to {len(LETTERS)} side by side")
+    options = shaped(options, images)
     box = corners(options)
     width, height = panel_size(aspect_of(box, options[0].equal), AREA)
     above = HEADING if len(options) > 1 else 0.0
@@ -156,7 +174,7 @@ def row_of(scenes: Scenes) -> tuple[Figure, list[tuple[Axes, Scene]]]:
     panels = []
     for number, scene in enumerate(options):
         left = MARGIN + number * (width + MARGIN)
-        axes = panel(figure, (left, MARGIN, width, height), scene, box)
+        axes = panel(figure, (left, MARGIN, width, height), scene, box, images)
         if above:
             axes.set_title(LETTERS[number], fontsize=12, fontweight="bold", pad=4)
         panels.append((axes, scene))
@@ -175,7 +193,13 @@ def panel_size(aspect: float, area: float) -> tuple[float, float]:
     return width, width * aspect
 
 
-def panel(figure: Figure, place: tuple[float, float, float, float], scene: Scene, box: Box) -> Axes:
+def panel(
+    figure: Figure,
+    place: tuple[float, float, float, float],
+    scene: Scene,
+    box: Box,
+    images: Images,
+) -> Axes:
     """Axes without ticks, with what does not move of a scene.
 
     Args:
@@ -183,13 +207,14 @@ def panel(figure: Figure, place: tuple[float, float, float, float], scene: Scene
         place: left, low, width and height; where units are equal, of the shape of ``box``.
         scene: the trajectory's.
         box: what is seen.
+        images: those that it shows.
     """
     axes = axes_at(figure, place)
     (left, low), (right, high) = box
     axes.set(xlim=(left, right), ylim=(low, high), xticks=[], yticks=[])
     for spine in axes.spines.values():
         spine.set(color="#bbbbbb", linewidth=0.8, zorder=2)
-    draw(axes, scene.still, scene)
+    draw(axes, scene.still, scene, images)
     return axes
 
 
@@ -200,15 +225,35 @@ def axes_at(figure: Figure, place: tuple[float, float, float, float]) -> Axes:
     return figure.add_axes((left / across, low / up, width / across, height / up))
 
 
-def draw(axes: Axes, shapes: Sequence[Shape], scene: Scene) -> list[Artist]:
-    """Draw shapes of a scene on top of what is there; what is returned can be removed again."""
-    drawn = [_artist(axes, shape, scene) for shape in shapes]
+def draw_end(axes: Axes, scene: Scene, images: Images) -> None:
+    """Draw the last frame of a scene."""
+    draw(axes, scene.frames[-1], scene, images, frame_count(scene, images) - 1)
+
+
+def draw(
+    axes: Axes, shapes: Sequence[Shape], scene: Scene, images: Images, moment: int = 0
+) -> list[Artist]:
+    """Draw shapes of a scene on top of what is there; what is returned can be removed again.
+
+    Args:
+        axes: the scene's panel.
+        shapes: of the scene.
+        scene: where they are of.
+        images: those that it shows.
+        moment: which frame of animated images.
+    """
+    drawn = [
+        _image(axes, images.at(shape, moment), scene)
+        if isinstance(shape, Picture)
+        else _artist(axes, shape)
+        for shape in shapes
+    ]
     for artist in drawn:
         artist.set(zorder=1, clip_on=True)  # of equals, the later is on top
     return drawn
 
 
-def _artist(axes: Axes, shape: Shape, scene: Scene) -> Artist:
+def _artist(axes: Axes, shape: Line | Patch | Disc | Label) -> Artist:
     """One shape, drawn."""
     match shape:
         case Line():
@@ -224,25 +269,22 @@ def _artist(axes: Axes, shape: Shape, scene: Scene) -> Artist:
             text = axes.text(*shape.at, shape.text, color=shape.colour, parse_math=False)
             text.set(fontsize=8, ha="center", va="center")
             return text
-        case Picture():
-            (left, low), (right, high) = scene.low, scene.high
-            image = image_of(shape)
-            return axes.imshow(image, extent=(left, right, low, high), aspect="auto")
 
 
-def image_of(picture: Picture) -> Image.Image:
-    """The image of a file; of an animation the first frame.
+def _image(axes: Axes, image: Image.Image, scene: Scene) -> Artist:
+    """An image in the middle of its scene, as large as there is room for all of it."""
+    (left, low), (right, high) = scene.low, scene.high
+    # Pixels of the figure that a unit of the scene takes.
+    across, up = axes.bbox.width / _span(axes.get_xlim()), axes.bbox.height / _span(axes.get_ylim())
+    scale = min((right - left) * across / image.width, (high - low) * up / image.height)
+    x, y = (left + right) / 2, (low + high) / 2
+    half, rise = image.width * scale / across / 2, image.height * scale / up / 2
+    return axes.imshow(image, extent=(x - half, x + half, y - rise, y + rise), aspect="auto")
 
-    Raises:
-        InputError: the file is missing, or no PNG, JPEG or GIF that can be read.
-    """
-    try:
-        with Image.open(picture.path, formats=("PNG", "JPEG", "GIF")) as image:
-            return image.convert("RGBA")
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise InputError(
-            f"{picture.path}: cannot be shown ({error}); expected a PNG, JPEG or GIF"
-        ) from None
+
+def _span(limits: tuple[float, float]) -> float:
+    """From one to the other."""
+    return limits[1] - limits[0]
 
 
 def as_image(figure: Figure) -> Image.Image:

@@ -5,6 +5,7 @@ Letters: N trajectories or queries, K options per query, D features.
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -41,10 +42,10 @@ class FilesTask(RecordedTask):
         images: str | None = None,
     ) -> None:
         if path is None:
-            raise InputError("path=null: expected the file of the trajectories; type task.path=…")
+            raise InputError("path=null: expected the file of the trajectories; type path=…")
         _check_columns(columns, images)
         found = read_columns(path, columns, images)
-        pictures = found.pop(images) if images is not None else None
+        self._pictures = None if images is None else _pictures(Path(path), found.pop(images))
         if len(found) < 2:
             raise InputError(
                 f"{path}: {len(found)} columns of features ({', '.join(found)}); expected two or "
@@ -52,8 +53,8 @@ class FilesTask(RecordedTask):
             )
         names = check_names(list(found), len(found))
         features = torch.from_numpy(np.stack(list(found.values()), -1))
+        del found  # which has taken as much again
         super().__init__(str(path), features, names)
-        self._pictures = None if pictures is None else _pictures(Path(path), pictures)
 
     def scene(self, trajectory: Tensor) -> Scene:
         """See :meth:`Task.scene`: its image, where there is one."""
@@ -80,22 +81,31 @@ def _check_columns(columns: Any, images: Any) -> None:
 
 
 def _pictures(path: Path, named: np.ndarray) -> list[str]:
-    """Absolute paths of the images that a column names.
+    """Absolute paths (N), or (N K) one after another, of the images that a column names.
 
     Raises:
         InputError: one is not there, is no image, or lies outside of the file's folder.
     """
-    folder, found = path.resolve().parent, []
-    for name in named.flatten().tolist():
-        try:
-            picture = (folder / name).resolve()
-            there = picture.is_file() and picture.is_relative_to(folder)
-        except (OSError, ValueError):  # what no file can be called
-            there = False
-        if not there or picture.suffix.lower() not in IMAGES:
-            raise InputError(
-                f"{path}: names the image {name!r:.200}; expected a file ({', '.join(IMAGES)}) in "
-                f"{folder} or below it"
-            )
-        found.append(str(picture))
-    return found
+    folder = path.resolve().parent
+    # A few images may be named millions of times: each is looked for once.
+    found = {name: _picture(path, folder, name) for name in dict.fromkeys(named.flat)}
+    return [found[name] for name in named.flat]
+
+
+def _picture(path: Path, folder: Path, name: str) -> str:
+    """The absolute path of an image that a file names, as from its folder.
+
+    Raises:
+        InputError: it is not there, is no image, or lies outside of the folder.
+    """
+    try:
+        picture = (folder / name).resolve()
+        there = picture.is_file() and picture.is_relative_to(folder)
+    except (OSError, ValueError):  # what no file can be called
+        there = False
+    if not there or picture.suffix.lower() not in IMAGES:
+        raise InputError(
+            f"{path}: names the image {name!r:.200}; expected a file ({', '.join(IMAGES)}) in "
+            f"{folder} or below it"
+        )
+    return sys.intern(str(picture))  # many names may be of one image

@@ -79,14 +79,14 @@ def _maker(id: Any) -> Callable[[], Any]:
         import gymnasium
     except ImportError:
         raise InputError(
-            "task=gymnasium: gymnasium is not installed; install it by "
+            "gymnasium is not installed; install it by "
             "pip install -c constraints.txt -e '.[gymnasium]'"
         ) from None
     if not isinstance(id, str) or ":" in id:
         raise InputError(
             f"id={id!r}: expected an environment that Gymnasium knows, such as "
             "MountainCarContinuous-v0; for one of your own type "
-            "task.make=<module>:<function that makes it>"
+            "make=<module>:<function that makes it>"
         )
     return lambda: gymnasium.make(id)
 
@@ -115,7 +115,7 @@ class VectorSimulator(Simulator):
             raise InputError(
                 f"the environment observes {observed!s:.80} and acts in {acted!s:.80}; expected "
                 "observations of Box and actions of Box or Discrete; wrap it, as by "
-                "gymnasium.wrappers.FlattenObservation, in a function for task.make"
+                "gymnasium.wrappers.FlattenObservation, in a function for make=<module>:<its name>"
             )
         self.size = size
         self.n_observed, self.n_actions = math.prod(observed.shape), math.prod(acted.shape)

@@ -35,11 +35,11 @@ class MinariTask(RecordedTask):
             import minari
         except ImportError:
             raise InputError(
-                "task=minari: minari is not installed; install it by "
+                "minari is not installed; install it by "
                 "pip install -c constraints.txt -e '.[minari]'"
             ) from None
         if not isinstance(id, str):
-            raise InputError(f"id={id!r}: expected a dataset, or its folder; type task.id=…")
+            raise InputError(f"id={id!r}: expected a dataset, or its folder; type id=…")
         try:
             data = minari.MinariDataset(_data_folder(id))
             spec = data.env_spec

@@ -230,7 +230,7 @@ def features_of(name: str, given: FeatureMap | None) -> FeatureMap:
         raise InputError(
             f"features=null: none come with the package for {name}, only for {', '.join(READY)}; "
             "write a function from observations (n T S), actions (n T A) and alive (n T) to "
-            "features (n D), and type task.features=<module>:<its name>"
+            "features (n D), and type features=<module>:<its name>"
         )
     return READY[name]
 

@@ -54,7 +54,7 @@ class Label:
 
 @dataclass(frozen=True)
 class Picture:
-    """An image file that fills the scene: PNG, JPEG or GIF, by its absolute path."""
+    """An image file in the scene, as large as fits: PNG, JPEG or GIF, by its absolute path."""
 
     path: str
 

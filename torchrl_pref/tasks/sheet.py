@@ -24,11 +24,12 @@ from torchrl_pref.tasks.drawing import (
     aspect_of,
     axes_at,
     checked,
-    draw,
+    draw_end,
     panel,
     panel_size,
     save_figure,
 )
+from torchrl_pref.tasks.images import Images, shaped
 from torchrl_pref.tasks.scene import Scene, corners
 
 COLOURS = ("#332288", "#44aa99", "#cc6677", "#ddaa33", "#aa4499", "#88ccee", "#117733", "#661100")
@@ -85,6 +86,7 @@ def sheet(
         scores: (N K D), features in standard deviations.
         names: D.
     """
+    queries = [shaped(options, Images()) for options in queries]
     boxes, equal = [corners(options) for options in queries], queries[0][0].equal
     aspect = median(aspect_of(box, equal) for box in boxes)
     width, height = panel_size(aspect, AREA)
@@ -99,10 +101,11 @@ def sheet(
         left = number % columns * across + 2 * MARGIN
         top = whole - number // columns * up - HEADING
         seen = widened(box, aspect) if equal else box
+        images = Images()  # which keeps those that move: of one query at a time
         for option, scene in enumerate(options):
             place = (left + option * (width + MARGIN), top - height, width, height)
-            axes = panel(figure, place, scene, seen)
-            draw(axes, scene.frames[-1], scene)
+            axes = panel(figure, place, scene, seen, images)
+            draw_end(axes, scene, images)
             title = axes.set_title(LETTERS[option], fontsize=9, fontweight="bold", pad=3)
             title.set_color(COLOURS[option])
         _text(figure, left, top + 0.05, f"{number + 1}", 9)

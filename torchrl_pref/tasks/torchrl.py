@@ -51,7 +51,7 @@ class TorchRLTask(RolloutTask):
         if make is None:
             raise InputError(
                 "make=null: expected a function of yours that makes a TorchRL environment; type "
-                "task.make=<module>:<its name>"
+                "make=<module>:<its name>"
             )
         self._make, self._policy = make, policy
         with torch.random.fork_rng(devices=[]):

@@ -16,8 +16,8 @@ import torch
 
 from torchrl_pref.compiled import share_out
 from torchrl_pref.errors import InputError
-from torchrl_pref.groups import allow, allowed
 from torchrl_pref.processes import spawning, track_resources
+from torchrl_pref.typed_code import allow, allowed
 
 if TYPE_CHECKING:
     from torchrl_pref.training.parts import Part

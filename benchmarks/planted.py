@@ -331,7 +331,8 @@ FAULTS = (
         "evaluation/statistics.py",
         "math.sqrt(len(values) / max(1, len(values) - 1))",
         "1.0",
-        HELDOUT,
+        f"{HELDOUT}::test_interval_covers_pools_and_seeds "
+        f"{HELDOUT}::test_interval_is_widened_by_what_few_pools_hide",
     ),
     Fault(
         "the environment is not seeded anew for each strategy that is compared",
@@ -366,7 +367,8 @@ FAULTS = (
         "evaluation/heldout.py",
         '(*APART, "training", "pool")',
         '(*APART, "pool")',
-        HELDOUT,
+        f"{HELDOUT}::test_policies_that_differ_in_their_seed_alone_are_one_kind "
+        f"{HELDOUT}::test_policies_of_two_trainings_are_two_kinds",
     ),
     Fault(
         "a file is copied to its place, and not put there at once",

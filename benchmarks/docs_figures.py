@@ -254,6 +254,7 @@ PARTS: dict[str, Part] = {
         docs_tables.beside_aprel,
     ),
     "dimension": measured("dimension", "docs/robustness.md", 30, "--features 8,16,32"),
+    "faults": measured("faults", "docs/robustness.md", 8),
 }
 """In the order in which they are made. The minutes of ``pretrained``, ``heldout`` and ``main_job``
 were measured, those of trainings follow from what one takes, and those of the other benchmarks are

@@ -215,6 +215,24 @@ def test_the_kernel_of_the_dpp_is_one_and_has_the_scores_on_its_diagonal() -> No
     assert torch.allclose(kernel, mirrored)
 
 
+def test_the_kernel_of_the_dpp_is_as_wide_as_its_authors_say() -> None:
+    """To the power of D: half the box around ψ and -ψ, over 2n."""
+    best, n = shortlist(6), 5
+    psi = (best.queries[:, 0] - best.queries[:, 1]).double()
+    box = math.prod(2 * side for side in psi.abs().amax(0).tolist())
+    twice = 2 * (box / 2 / (2 * n)) ** (2 / 3)
+
+    def near(i: int, j: int) -> float:
+        apart = (float((psi[i] - sign * psi[j]).square().sum()) for sign in (1, -1))
+        return sum(math.exp(-square / twice) for square in apart)
+
+    kernel = dpp_kernel(best, n)
+    for i, j in itertools.combinations(range(6), 2):
+        expected = near(i, j) * math.sqrt(best.values[i] * best.values[j])
+        expected /= math.sqrt(near(i, i) * near(j, j))
+        assert float(kernel[i, j]) == pytest.approx(expected, rel=1e-5)
+
+
 def test_hull_vertices_are_those_of_qhull() -> None:
     from scipy.spatial import ConvexHull
 

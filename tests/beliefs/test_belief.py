@@ -11,6 +11,7 @@ from torch import Generator, Tensor
 from benchmarks.posterior import Case, compare, history
 from torchrl_pref.beliefs.resampling import kish_share
 from torchrl_pref.beliefs.sampled import RESTART_SHARE, Belief, uniform_sphere
+from torchrl_pref.beliefs.slice import Target
 from torchrl_pref.questions.choice import feature_gaps
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.questions.responses import Boltzmann, Optimal
@@ -104,6 +105,21 @@ def test_effective_sample_size_is_what_it_says(
     assert float(true) < 80  # so few moves leave copies alike: there is something to report
     assert float(ess.mean()) == pytest.approx(float(true), rel=0.15)
     assert ((ess >= 1) & (ess <= 100)).all()
+
+
+class Still(Belief):
+    """Its samples forget nothing."""
+
+    def _move(self, samples: Tensor, target: Target, generator: Generator) -> Tensor:
+        return samples
+
+
+def test_what_was_lost_before_counts_until_it_is_forgotten(generator: Generator) -> None:
+    """An answer about options that are alike loses nothing more."""
+    belief = Still(Boltzmann(2.0))
+    samples, ess = belief.prior(5, 4, generator), torch.tensor([100.0, 80.0, 50.0, 20.0, 5.0])
+    alike = told(torch.zeros(5, 0, 1, 4), torch.zeros(5, 1, 4))
+    assert torch.allclose(belief.update(samples, ess, alike, generator).ess, ess, rtol=0.01)
 
 
 @pytest.mark.parametrize(("n_features", "n_options"), [(4, 2), (10, 3)])

@@ -125,6 +125,13 @@ def test_resampling_follows_the_weights(draw: object, generator: Generator) -> N
     assert float(kish_share(torch.full((4,), -math.inf))) == 0
 
 
+def test_the_luck_of_resampling_favours_no_sample(generator: Generator) -> None:
+    shares = torch.tensor([0.3, 0.7, 1.2, 1.8])
+    samples, log_weights = torch.eye(4).expand(20_000, 4, 4), shares.log().expand(20_000, 4)
+    copies, _ = resample(samples, log_weights, generator)
+    assert copies.mean(0).sum(0).tolist() == pytest.approx(shares.tolist(), abs=0.02)
+
+
 def test_resampling_is_the_same_compiled_and_in_tensors(generator: Generator) -> None:
     samples = torch.randn(50, 30, 3, generator=generator)
     log_weights = 3 * torch.randn(50, 30, generator=generator)

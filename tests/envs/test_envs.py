@@ -173,6 +173,19 @@ def test_feed_truncates_at_its_offers(pool: QueryPool) -> None:
     assert make(FeedEnv, pool).n_offers == 10
 
 
+@pytest.mark.parametrize("kind", ENVS)
+def test_what_is_left_is_told_as_shares_of_all_asks_and_offers(kind: type, pool: QueryPool) -> None:
+    env = make(kind, pool)
+    ask = RandomAsk(0.5) if kind is FeedEnv else RandomQuery()
+    data = env.rollout(10, ask)
+    asked = (data["session", "history", "answers"] != OPEN).sum(-1, keepdim=True)
+    left = [1 - asked / 5]
+    if kind is FeedEnv:
+        offered = torch.arange(data.shape[1])[:, None].expand_as(asked)
+        left.append(1 - offered / 10)
+    assert torch.equal(data["remaining"], torch.cat(left, -1))
+
+
 def test_candidates_are_a_fresh_subset_for_each_session(pool: QueryPool) -> None:
     env = make(QueryEnv, pool, candidates=10)
     data = env.rollout(10, coin(env), break_when_any_done=False)
@@ -181,6 +194,7 @@ def test_candidates_are_a_fresh_subset_for_each_session(pool: QueryPool) -> None
     assert torch.equal(data["queries"], pool.features[chosen])
     assert all(len(row.unique()) == 10 for row in chosen.flatten(0, 1))
     assert torch.equal(chosen[:, 0], chosen[:, 4])
+    assert not torch.equal(chosen[0, 0], chosen[1, 0])
     assert not torch.equal(chosen[:, 4], chosen[:, 5])
     assert make(QueryEnv, pool, candidates=10**6).n_candidates == len(pool)
 

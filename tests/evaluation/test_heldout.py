@@ -255,3 +255,9 @@ def test_policies_that_differ_in_their_seed_alone_are_one_kind() -> None:
         "policy_query:scorer, objective=entropy": 1,
     }
     assert list(kinds_of(twice)) == ["policy_query"]
+
+
+def test_policies_of_two_trainings_are_two_kinds() -> None:
+    both = [checkpoint_of(settings_of("query", updates=updates)) for updates in (6, 7)]
+    names = [f"policy_query:scorer, training.updates={updates}" for updates in (6, 7)]
+    assert list(kinds_of(both)) == names

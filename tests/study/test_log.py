@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import sqlite3
+from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -26,6 +28,17 @@ def test_events_are_there_after_the_file_was_opened_again(log: Log) -> None:
     assert (first.participant, second.participant) == ("P1", "P2")
     assert first.number < second.number
     assert [event.participant for event in again.events("P2")] == ["P2"]
+
+
+def test_events_are_in_their_order_whatever_the_clock_says(
+    log: Log, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    days = iter(datetime(2026, 1, day, tzinfo=UTC) for day in (2, 1))
+    clock = SimpleNamespace(now=lambda zone: next(days))
+    monkeypatch.setattr("torchrl_pref.study.log.datetime", clock)
+    for said in (0, 1):
+        log.append("P1", "answer", {"said": said})
+    assert [event.content["said"] for event in log.events("P1")] == [0, 1]
 
 
 def test_what_may_be_once_is_once(log: Log) -> None:

@@ -19,6 +19,7 @@ from test_cli import keys_of
 
 import typed
 from benchmarks import docs_figures, docs_tables
+from benchmarks.planted import FAULTS, Fault
 from torchrl_pref.config.settings import check_evaluate_settings, check_train_settings
 from torchrl_pref.config.study import check_ask_settings
 from torchrl_pref.evaluation.records import Entry, Records
@@ -259,3 +260,11 @@ def test_a_cell_of_the_protocol_is_a_table() -> None:
     assert policy["strategy"] == "**RL**"
     assert policy["reaches 0.500 after"] == "0"
     assert docs_tables.table([greedy, policy]).startswith("| strategy ")
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.what)
+def test_a_fault_can_be_planted(fault: Fault) -> None:
+    """What ``benchmarks/faults.py`` changes stands there once, and the tests are there."""
+    assert (ROOT / "torchrl_pref" / fault.file).read_text().count(fault.old) == 1
+    for name in fault.tests.split():
+        assert (ROOT / "tests" / name.partition("::")[0]).exists()

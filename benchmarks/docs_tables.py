@@ -200,14 +200,24 @@ def transposed(rows: Rows) -> Rows:
     return [{"": name, **{f"{head} {row[head]}": row[name] for row in rows}} for name in names]
 
 
+OBJECTIVES = {
+    "control": "rewarded for information",
+    "started": "started at information_gain, rewarded for alignment",
+    "mean": "learned from nothing, sees the mean of the belief",
+    "covariance": "the same, sees mean and covariance",
+    "samples": "the same, sees all samples",
+}
+"""What each training of that part is."""
+
+
 def objectives(folder: Path) -> dict[str, str]:
     """What an objective is worth, and what is learned from nothing: one training of each."""
     rows = []
-    for run in ("control", "started", "mean", "covariance", "samples"):
+    for run, what in OBJECTIVES.items():
         records = read_records(folder / f"{run}-evaluated" / CSV)
         keys = records.strategies if run == "control" else filter(is_judged, records.strategies)
         for key in keys:
-            name = f"{name_of(key)}, {run}" if is_judged(key) else name_of(key)
+            name = f"RL, {what}" if is_judged(key) else name_of(key)
             rows.append(beside_information(name, records, key))
     return {"objectives": table(rows)}
 

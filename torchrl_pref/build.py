@@ -318,6 +318,11 @@ def load_policy(checkpoint: Checkpoint | str | Path, env: EnvBase) -> Policy:
     """
     if not isinstance(checkpoint, Checkpoint):
         checkpoint = Checkpoint.load(checkpoint)
+    if len(env.batch_size) != 1:
+        raise InputError(
+            f"an environment of batch size {tuple(env.batch_size)}: expected one size, as a policy "
+            "is for the sessions of one environment; make it for one with a larger batch_size"
+        )
     settings = checkpoint.settings
     setup = "feed" if is_feed(env) else "query"
     if settings["setup"]["name"] != setup:

@@ -321,6 +321,11 @@ def _same(env: FeedEnv) -> FeedEnv:
     return env
 
 
+def test_a_policy_is_not_for_the_workers_of_an_environment() -> None:
+    with pytest.raises(InputError, match=r"batch size \(2, 3\): expected one size"):
+        pretrained_policy(SerialEnv(2, _feed))
+
+
 def test_a_copy_faces_other_humans_unless_it_has_a_seed() -> None:
     env, seeded = _feed(), _feed(seed=3)
     assert not torch.equal(copy.deepcopy(env).reset()["samples"], env.reset()["samples"])

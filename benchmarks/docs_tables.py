@@ -231,11 +231,20 @@ def beside_information(name: str, records: Records, key: str) -> dict[str, str]:
     return row
 
 
+NOISE_RANGE = {
+    "RL (range)": "RL, trained across the range",
+    "RL (one)": "RL, trained at one tau (the Gridworld's of the package, seed 0)",
+}
+"""What each run of that part is."""
+
+
 def noise_range(folder: Path) -> dict[str, str]:
     """Policies trained at one tau and across the range, where humans differ in theirs."""
     records = read_records(folder / "evaluated" / CSV)
     wanted = [*RULES, *filter(is_judged, records.strategies)]
     rows = [beside_information(name_of(key), records, key) for key in wanted]
+    for row in rows:
+        row["strategy"] = NOISE_RANGE.get(row["strategy"], row["strategy"])
     return {"noise_range": table(rows)}
 
 

@@ -1,6 +1,7 @@
 """One person, 20 questions of a pool of 100,000: CPU seconds a question, and memory.
 
-The exit status is 1 where a question takes more than .3 s in the mean, or all more than 1 GiB.
+The exit status is 1 where a question takes more than .3 s in the mean, or all more than 1 GiB, by
+the strategies that are there to be used on such pools.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import json
 import resource
 import subprocess
 import time
+from itertools import product
 
 import torch
 from torch import Generator
@@ -26,6 +28,8 @@ from torchrl_pref.questions.responses import Boltzmann
 from torchrl_pref.session import Session
 
 STRATEGIES = ("information_gain", "alignment_gain", "policy")
+SLOWER = ("thompson", "max_regret", "disagreement", "knowledge_gradient")
+"""What is not compiled: with tau known alone, and not held to the bounds."""
 
 BELIEFS = ("tau known", "tau unknown")
 """With the first, whoever answers is thought to be of tau 4.5; with the second this is inferred,
@@ -69,12 +73,12 @@ def main() -> None:
         print(json.dumps(measure(*typed.one, typed.size)))
         return
     rows = []
-    for strategy in STRATEGIES:
-        for belief in BELIEFS:
-            again = [sys.executable, __file__, f"--size={typed.size}", "--one", strategy, belief]
-            rows.append(json.loads(subprocess.check_output(again, text=True)))
+    for strategy, belief in (*product(STRATEGIES, BELIEFS), *product(SLOWER, BELIEFS[:1])):
+        again = [sys.executable, __file__, f"--size={typed.size}", "--one", strategy, belief]
+        rows.append(json.loads(subprocess.check_output(again, text=True)))
     common.report(f"One person, {QUESTIONS} questions, M = 100, D = 4", rows, typed.json)
-    kept = all(row["CPU s a question"] <= 0.3 and row["MiB in all"] <= 1024 for row in rows)
+    bound = [row for row in rows if row["strategy"] in STRATEGIES]
+    kept = all(row["CPU s a question"] <= 0.3 and row["MiB in all"] <= 1024 for row in bound)
     raise SystemExit(not kept)
 
 

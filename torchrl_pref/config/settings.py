@@ -233,7 +233,8 @@ def check_evaluate_settings(settings: Plain) -> Settings:
     named = settings["strategy"]
     for name in [named] if isinstance(named, str) else named or []:
         if ":" not in name:
-            refuse_batches(settings, f"strategy={name}")
+            batches = "what chooses batches is there without being named"
+            refuse_batches(settings, f"strategy={name} ({batches})")
     check_together(settings)
     in_feed = "policy" in settings and settings["setup"]["name"] == "feed"
     if in_feed and settings["skip"] != "free":

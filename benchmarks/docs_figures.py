@@ -128,7 +128,7 @@ PARTS: dict[str, Part] = {
     "heldout": Part(
         "docs/results.md",
         (f"{HELDOUT} checkpoint=[{MADE_FOR_IT}] hydra.run.dir={{folder}} -> {CSV}",),
-        13,
+        8,
         docs_tables.heldout,
     ),
     "paper": Part(

@@ -103,6 +103,11 @@ def on_task(task: str) -> Iterator[str]:
 SWEEP = "hydra.sweep.dir={folder}/sweep"
 TWO = "hydra/launcher=joblib hydra.launcher.n_jobs=2"
 CELLS = [f"{setup}-{tau}" for setup in ("feed", "query") for tau in ("noisy", "optimal")]
+OF_CELLS = [f"{{folder}}/runs/{cell}" for cell in CELLS]
+FEED = "python train.py setup=feed tau=noisy"
+MORE = [(seed, f"{{folder}}/runs/feed-noisy-{seed}") for seed in range(1, SEEDS)]
+"""Trainings of the cell in which one tells least, with other seeds."""
+
 SHEET = "python -m torchrl_pref.tasks {task} --animate --out {{folder}}/{task}.png -> {task}.gif"
 PENDULUM = "python examples/pendulum_file.py {folder}/pendulum.csv 2000 -> pendulum.csv"
 START = "policy.start=information_gain training.learning_rate=0.01 training.updates=200"
@@ -201,7 +206,11 @@ PARTS: dict[str, Part] = {
         "docs/results.md",
         (
             "python benchmarks/main_job.py --folder {folder}/runs -> runs/query-optimal/tables.txt",
-            f"python benchmarks/quality.py {' '.join(f'{{folder}}/runs/{c}' for c in CELLS)} "
+            *(
+                f"{FEED} seed={seed} hydra.run.dir={run} -> {run[9:]}/tables.txt"
+                for seed, run in MORE
+            ),
+            f"python benchmarks/quality.py {' '.join([*OF_CELLS, *(run for _, run in MORE)])} "
             "--json {folder}/quality.json -> quality.json",
         ),
         20,

@@ -251,7 +251,7 @@ PARTS: dict[str, Part] = {
         "room_finer", "docs/strategies.md", 8, '--pools 16 --only "D=8;tau unknown"', "room"
     ),
     "room_feed": measured("room_feed", "docs/strategies.md", 40, "--setup feed", "room"),
-    "large_pool": measured("large_pool", "docs/speed.md", 1),
+    "large_pool": measured("large_pool", "docs/speed.md", 3),
     "aprel": Part(
         "docs/aprel.md",
         (

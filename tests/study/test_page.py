@@ -328,7 +328,12 @@ def test_images_and_nothing_from_elsewhere(tmp_path: Path, browser: Browser, kin
 
 DRAWN = """
 const canvas = document.querySelector("main canvas");
-const pixels = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
+// A copy: the browser complains of a canvas that is read from again and again.
+const copy = document.createElement("canvas");
+[copy.width, copy.height] = [canvas.width, canvas.height];
+const seen = copy.getContext("2d", {willReadFrequently: true});
+seen.drawImage(canvas, 0, 0);
+const pixels = seen.getImageData(0, 0, copy.width, copy.height).data;
 return pixels.some((value) => value > 0);
 """
 

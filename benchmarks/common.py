@@ -10,7 +10,9 @@ from __future__ import annotations
 import argparse
 import json
 import platform
+import shutil
 import statistics
+import subprocess
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -160,3 +162,21 @@ def belief_samples(n_sessions: int, n_samples: int = 100, n_features: int = 4) -
 def told(earlier: Tensor, newest: Tensor) -> Evidence:
     """The evidence of choices with feature gaps (S H K-1 D), and then one more (S K-1 D)."""
     return evidence_of_gaps(torch.cat([earlier, newest.unsqueeze(1)], 1))
+
+
+def copy_to(folder: Path) -> list[Path]:
+    """Copy the tracked files, as they are in the working tree, and the machine code of those that
+    Numba compiled: it is valid for as long as a file has its size and time.
+
+    Returns:
+        The tracked files that are there, as from the root.
+    """
+    root = Path(__file__).resolve().parents[1]
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=root, capture_output=True, check=True)
+    names = [Path(name) for name in listed.stdout.decode().split("\0") if name]
+    tracked = [name for name in names if (root / name).is_file()]
+    compiled = [path.relative_to(root) for path in root.glob("torchrl_pref/**/__pycache__/*.nb?")]
+    for name in (*tracked, *compiled):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(root / name, folder / name)
+    return tracked

@@ -24,9 +24,9 @@ import os
 import re
 import shlex
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from tabulate import tabulate
 from tqdm import tqdm
@@ -80,13 +80,14 @@ def measured(
     minutes: float,
     more: str = "",
     script: str | None = None,
-    write: docs_tables.Writer | None = None,
+    choose: Callable[[Any], Any] = list,
 ) -> Part:
-    """A benchmark that writes its table as JSON: of the part's name, or another."""
+    """A benchmark that writes its table as JSON: of the part's name, or another; of its rows the
+    page shows what ``choose`` makes of them."""
     command = (
         f"python benchmarks/{script or name}.py {more} --json {{folder}}/{name}.json -> {name}.json"
     )
-    return Part(page, (command,), minutes, write or benchmark(name))
+    return Part(page, (command,), minutes, benchmark(name, choose))
 
 
 def on_task(task: str) -> Iterator[str]:
@@ -103,10 +104,8 @@ def on_task(task: str) -> Iterator[str]:
 SWEEP = "hydra.sweep.dir={folder}/sweep"
 TWO = "hydra/launcher=joblib hydra.launcher.n_jobs=2"
 CELLS = [f"{setup}-{tau}" for setup in ("feed", "query") for tau in ("noisy", "optimal")]
-OF_CELLS = [f"{{folder}}/runs/{cell}" for cell in CELLS]
-FEED = "python train.py setup=feed tau=noisy"
-MORE = [(seed, f"{{folder}}/runs/feed-noisy-{seed}") for seed in range(1, SEEDS)]
-"""Trainings of the cell in which one tells least, with other seeds."""
+MORE = {seed: f"feed-noisy-{seed}" for seed in range(1, SEEDS)}
+"""Runs of the cell in which one training tells least, with other seeds."""
 
 SHEET = "python -m torchrl_pref.tasks {task} --animate --out {{folder}}/{task}.png -> {task}.gif"
 PENDULUM = "python examples/pendulum_file.py {folder}/pendulum.csv 2000 -> pendulum.csv"
@@ -207,10 +206,12 @@ PARTS: dict[str, Part] = {
         (
             "python benchmarks/main_job.py --folder {folder}/runs -> runs/query-optimal/tables.txt",
             *(
-                f"{FEED} seed={seed} hydra.run.dir={run} -> {run[9:]}/tables.txt"
-                for seed, run in MORE
+                f"python train.py setup=feed tau=noisy seed={seed} "
+                f"hydra.run.dir={{folder}}/runs/{run} -> runs/{run}/tables.txt"
+                for seed, run in MORE.items()
             ),
-            f"python benchmarks/quality.py {' '.join([*OF_CELLS, *(run for _, run in MORE)])} "
+            "python benchmarks/quality.py "
+            f"{' '.join(f'{{folder}}/runs/{run}' for run in (*CELLS, *MORE.values()))} "
             "--json {folder}/quality.json -> quality.json",
         ),
         20,
@@ -218,16 +219,14 @@ PARTS: dict[str, Part] = {
     ),
     "select": measured("select", "docs/speed.md", 3),
     "limit": measured("limit", "docs/speed.md", 2),
-    "belief": measured(
-        "belief", "docs/speed.md", 10, write=benchmark("belief", docs_tables.after_twenty)
-    ),
+    "belief": measured("belief", "docs/speed.md", 10, choose=docs_tables.after_twenty),
     "session": measured("session", "docs/speed.md", 2),
     "scale": measured(
         "scale",
         "docs/speed.md",
         5,
         "--plot {folder}/scale.png",
-        write=benchmark("scale", docs_tables.ends),
+        choose=docs_tables.ends,
     ),
     "train": measured("train", "docs/speed.md", 10),
     "main_job": measured("main_job", "docs/speed.md", 7),

@@ -48,7 +48,7 @@ def table(rows: Rows) -> str:
     return tabulate(rows, headers="keys", tablefmt="pipe", disable_numparse=True)
 
 
-def benchmark(name: str, choose: Callable[[Any], Any] = lambda rows: rows) -> Writer:
+def benchmark(name: str, choose: Callable[[Any], Any] = list) -> Writer:
     """The table that a benchmark left as JSON, or what ``choose`` makes of its rows."""
 
     def write(folder: Path) -> dict[str, str]:
@@ -224,11 +224,21 @@ def objectives(folder: Path) -> dict[str, str]:
 
 def beside_information(name: str, records: Records, key: str) -> dict[str, str]:
     """A strategy on the way and in the end, with its difference to information gain."""
-    values, gap = alignment(records, key), difference(records, key, RULES[0])
-    row = {"strategy": name}
-    row |= {f"after {j}": f"{values[..., j].mean():.3f}" for j in milestones(20)}
-    row["minus information_gain, last"] = "" if key == RULES[0] else interval(gap[..., -1])
-    return row
+    less = minus_information(records, key)
+    last = "" if less is None else interval(less[..., -1])
+    return {**on_the_way(name, records, key), "minus information_gain, last": last}
+
+
+def on_the_way(name: str, records: Records, key: str) -> dict[str, str]:
+    """A strategy's alignment after some of 20 questions."""
+    values = alignment(records, key)
+    after = {f"after {j}": f"{values[..., j].mean():.3f}" for j in milestones(20)}
+    return {"strategy": name, **after}
+
+
+def minus_information(records: Records, key: str) -> Tensor | None:
+    """A strategy's paired differences to greedy information gain; None for that itself."""
+    return None if key == RULES[0] else difference(records, key, RULES[0])
 
 
 NOISE_RANGE = {
@@ -255,20 +265,23 @@ def literature(folder: Path) -> dict[str, str]:
     for path in sorted(folder.glob(f"*-heldout/{CSV}")):
         records = read_records(path)
         for cell in records.tasks:
-            own, rows = records.of_task(cell), []
-            for key in own.strategies:
-                values, gap = alignment(own, key), difference(own, key, RULES[0])
-                name = name_of(key)
-                if is_judged(key):
-                    from_grid = "gridworld" in key
-                    name = "RL, made for the Gridworld" if from_grid else "RL, trained on it"
-                row = {"strategy": name}
-                row |= {f"after {j}": f"{values[..., j].mean():.3f}" for j in milestones(20)}
-                row["mean of 1 to 20"] = f"{values[..., 1:].mean():.3f}"
-                mean = "" if key == RULES[0] else interval(gap[..., 1:].mean(-1))
-                rows.append({**row, "minus information_gain, mean": mean})
+            own = records.of_task(cell)
+            rows = [literature_row(own, key) for key in own.strategies]
             tables[f"tasks-{cell.replace('/', '-')}"] = table(rows)
     return tables
+
+
+def literature_row(records: Records, key: str) -> dict[str, str]:
+    """A strategy on one of these tasks, on the way and in the mean over the questions."""
+    name = name_of(key)
+    if is_judged(key):
+        name = "RL, made for the Gridworld" if "gridworld" in key else "RL, trained on it"
+    less = minus_information(records, key)
+    return {
+        **on_the_way(name, records, key),
+        "mean of 1 to 20": f"{alignment(records, key)[..., 1:].mean():.3f}",
+        "minus information_gain, mean": "" if less is None else interval(less[..., 1:].mean(-1)),
+    }
 
 
 def tasks(folder: Path) -> dict[str, str]:

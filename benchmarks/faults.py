@@ -15,7 +15,6 @@ sys.path[0] = str(ROOT)  # this folder's select.py hides Python's
 import argparse
 import os
 import re
-import shutil
 import subprocess
 import tempfile
 from collections.abc import Iterator
@@ -23,7 +22,7 @@ from contextlib import contextmanager
 
 from tqdm import tqdm
 
-from benchmarks.common import Row, report
+from benchmarks.common import Row, copy_to, report
 from benchmarks.planted import FAULTS, Fault
 
 PACKAGE = "torchrl_pref"
@@ -32,18 +31,6 @@ LONGEST = 300
 """Seconds that the tests of a fault may take."""
 
 PYTEST = ("-m", "pytest", "-x", "-q", "--tb=no", "-rfE", "-p", "no:cacheprovider")
-
-
-def copy_to(folder: Path) -> None:
-    """Copy the tracked files, as they are in the working tree, and the machine code of those that
-    Numba compiled: it is valid for as long as a file has its size and time."""
-    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True)
-    names = [Path(name) for name in listed.stdout.decode().split("\0") if name]
-    names += [path.relative_to(ROOT) for path in (ROOT / PACKAGE).rglob("__pycache__/*.nb?")]
-    for name in names:
-        if (ROOT / name).is_file():
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(ROOT / name, folder / name)
 
 
 def changed(fault: Fault, text: str) -> str:

@@ -16,7 +16,6 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[0] = str(ROOT)  # and not this folder, whose select.py would hide Python's own
 
 import os
-import shutil
 import subprocess
 import tempfile
 from typing import NamedTuple
@@ -130,11 +129,7 @@ def tried(new: New) -> common.Row:
     """Put it in and try it, in a copy of its own."""
     with tempfile.TemporaryDirectory() as place:
         root = Path(place)
-        listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
-        names = listed.stdout.splitlines()
-        for name in names:
-            (root / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy(ROOT / name, root / name)
+        names = common.copy_to(root)
         put_in(new, root)
         touched = sum((root / name).read_bytes() != (ROOT / name).read_bytes() for name in names)
         return {

@@ -119,12 +119,10 @@ def check(settings: Plain) -> Settings:
             f"policy={settings['policy'].get('make')}: a policy of yours is evaluated as it was "
             "trained; add checkpoint=<its run folder>, or name a strategy by strategy="
         )
-    if typed.was_typed("tau"):
-        return _checked(settings)
     try:
         return _checked(settings)
     except InputError as error:
-        if settings["tau"] != ["noisy", "optimal"]:
+        if typed.was_typed("tau") or settings["tau"] != ["noisy", "optimal"]:
             raise
         try:
             checked = _checked({**settings, "tau": ["noisy"]})

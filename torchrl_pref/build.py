@@ -19,7 +19,8 @@ from torchrl_pref.checkpoints.restore import restore_weights
 from torchrl_pref.config.sections import GroupSection, Settings
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
-from torchrl_pref.envs.session import is_feed, refuse_other_setup
+from torchrl_pref.envs.session import is_feed
+from torchrl_pref.envs.setups import refuse_other_setup, setups_of
 from torchrl_pref.errors import InputError, check_seed
 from torchrl_pref.groups import make
 from torchrl_pref.humans.base import HumanBase
@@ -324,7 +325,7 @@ def load_policy(checkpoint: Checkpoint | str | Path, env: EnvBase) -> Policy:
             "is for the sessions of one environment; make it for one with a larger batch_size"
         )
     settings = checkpoint.settings
-    setup = "feed" if is_feed(env) else "query"
+    setup, _ = setups_of(env)
     if settings["setup"]["name"] != setup:
         raise InputError(
             f"a policy of setup={settings['setup']['name']} cannot decide in one of "

@@ -11,7 +11,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_pref.build import load_policy
 from torchrl_pref.checkpoints.checkpoint import Checkpoint
-from torchrl_pref.envs.session import is_feed
+from torchrl_pref.envs.setups import setups_of
 from torchrl_pref.errors import InputError, check_choice, check_count
 from torchrl_pref.policies.base import Policy
 from torchrl_pref.runs import CHECKPOINT
@@ -54,7 +54,7 @@ def pretrained_policy(env: EnvBase, tau: str | None = None, seed: int = 0) -> Po
     Raises:
         InputError: there is no such policy, or it cannot decide there (:func:`build.load_policy`).
     """
-    setup = "feed" if is_feed(env) else "query"
+    setup, _ = setups_of(env)
     return load_policy(pretrained_checkpoint(setup, tau, seed), env)
 
 

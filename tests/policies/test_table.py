@@ -9,7 +9,7 @@ from torchrl.envs import TransformedEnv
 from torchrl_pref.checkpoints.restore import restore_weights
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
-from torchrl_pref.envs.session import refuse_other_setup
+from torchrl_pref.envs.setups import refuse_other_setup
 from torchrl_pref.errors import InputError
 from torchrl_pref.policies import POLICIES
 from torchrl_pref.policies.base import Policy, PolicyKind

@@ -121,7 +121,7 @@ def parts_of(settings: Settings, *pool_shape: int) -> Iterator[Part]:
         own = "setup.offers" if setup["name"] == "feed" else "setup.candidates"
         keys = ("training.sessions", "training.steps", "training.stages", *beliefs, *sizes, own)
         yield Part("training", frames * kept, keys)
-        yield Part("the processes", PROCESS * n_parts(settings), ("training.processes",))
+        yield Part("the processes", PROCESS * n_processes(settings), ("training.processes",))
     humans = settings["evaluation"]["humans"]
     if settings.get("protocol") is not None:
         humans = HELD_OUT * settings["workers"]
@@ -153,12 +153,17 @@ def steps_and_stages(steps: int | None, stages: int, longest: int) -> tuple[int,
     return steps, min(stages, -(-longest // steps))
 
 
-def n_parts(settings: Settings) -> int:
-    """Processes that ask the sessions of a training, at most."""
-    training = settings.get("training")
-    if training is None or training["problems"] == "drawn" or settings["device"] != "cpu":
-        return 1
-    return len(sizes_of_parts(training["sessions"], training["processes"]))
+def session_parts(settings: Settings) -> list[int]:
+    """B of each part of a training's sessions, each of which a process may ask."""
+    training = settings["training"]
+    # Drawn problems are one after the other; what a GPU computes at once is best asked at once.
+    together = training["problems"] == "drawn" or not settings["device"].startswith("cpu")
+    return sizes_of_parts(training["sessions"], 1 if together else training["processes"])
+
+
+def n_processes(settings: Settings) -> int:
+    """Processes that ask at once, at most; of an evaluation it is one."""
+    return len(session_parts(settings)) if "training" in settings else 1
 
 
 def sizes_of(settings: Settings, n_options: int) -> tuple[int, int, int]:
@@ -204,11 +209,11 @@ def _belief_parts(settings: Settings, n_options: int, n_features: int) -> Iterat
     if belief["name"] == "laplace":
         there = settings["setup"]["budget"] * n_factors * n_rows + _rows_shown(settings)
         each = laplace_numbers(samples, there, n_features)
-        held = max(each, min(sessions * each, n_parts(settings) * LAPLACE_HELD))
+        held = max(each, min(sessions * each, n_processes(settings) * LAPLACE_HELD))
         yield Part("the Gaussian of belief=laplace", 8.0 * LAPLACE_COPIES * held, keys)
     else:
         moves = belief.get("moves") or default_moves(n_features)
-        at_once = max(samples, min(sessions * samples, n_parts(settings) * (MOVED // moves)))
+        at_once = max(samples, min(sessions * samples, n_processes(settings) * (MOVED // moves)))
         directions = 4.0 * (UNIFORMS * moves + 4 * n_features) * at_once
         yield Part("moving the belief", directions, ("belief.samples", "belief.moves"))
         answers = 8.0 * _padded_rows(settings, n_factors, n_rows) * at_once

@@ -42,7 +42,6 @@ from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Generator, Tensor
 from torchrl.data import Binary, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
@@ -59,7 +58,7 @@ from torchrl_pref.envs.transition import (
     rows,
     tell,
 )
-from torchrl_pref.errors import InputError, OtherSetup, check_count, check_type
+from torchrl_pref.errors import InputError, check_count, check_type
 from torchrl_pref.humans.base import HumanBase
 from torchrl_pref.humans.demonstrations import Demonstrations
 from torchrl_pref.pool import QueryPool
@@ -71,25 +70,6 @@ from torchrl_pref.tensors import check_finite, check_range, check_shape, directi
 def is_feed(env: EnvBase) -> bool:
     """Whether an environment, transformed or not, offers queries; if not, it shows candidates."""
     return "offer" in env.observation_spec.keys()  # noqa: SIM118, a spec is no dictionary
-
-
-ALONE = {"feed": ("offer", "n_offered"), "query": ("queries", "action_mask")}
-"""What one setup shows and the other does not."""
-
-
-def refuse_other_setup(what: str, asks: TensorDictModuleBase, env: EnvBase) -> None:
-    """Refuse what reads something that this environment does not show.
-
-    Raises:
-        OtherSetup: it does; ``what`` was typed for it.
-    """
-    here, there = ("feed", "query") if is_feed(env) else ("query", "feed")
-    for key in ALONE[there]:
-        if key in asks.in_keys:
-            raise OtherSetup(
-                f"{what} with setup={here}: it reads {key}, which setup={there} alone shows; type "
-                "that, or name another"
-            )
 
 
 class SessionEnv(EnvBase):

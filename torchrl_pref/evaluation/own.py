@@ -24,7 +24,8 @@ from torchrl_pref.acquisition.per_second import Cost
 from torchrl_pref.config.sections import Settings
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
-from torchrl_pref.envs.session import is_feed, refuse_other_setup
+from torchrl_pref.envs.session import is_feed
+from torchrl_pref.envs.setups import refuse_other_setup
 from torchrl_pref.errors import InputError, OtherSetup, check_choice
 from torchrl_pref.evaluation.side_by_side import Entrant
 from torchrl_pref.evaluation.style import is_there

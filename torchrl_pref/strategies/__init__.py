@@ -20,6 +20,7 @@ from torchrl_pref.acquisition.knowledge_gradient import KnowledgeGradient
 from torchrl_pref.acquisition.pairs import max_regret
 from torchrl_pref.acquisition.per_second import Cost, PerSecond
 from torchrl_pref.envs.session import is_feed
+from torchrl_pref.envs.setups import setups_of
 from torchrl_pref.errors import OtherSetup, check_choice
 from torchrl_pref.strategies.batches import BatchOf
 from torchrl_pref.strategies.feed import OfferRank, QuantileAsk, RandomAsk, ThresholdAsk
@@ -112,11 +113,10 @@ def make_strategy(
         InputError: there is none.
         OtherSetup: there is one for the other setup alone.
     """
-    known, others = FEED_STRATEGIES, STRATEGIES
-    if not is_feed(env):
-        known, others = others, known
-    if name in others and name not in known:
-        here, there = ("feed", "query") if is_feed(env) else ("query", "feed")
+    here, there = setups_of(env)
+    tables = {"feed": FEED_STRATEGIES, "query": STRATEGIES}
+    known = tables[here]
+    if name in tables[there] and name not in known:
         raise OtherSetup(
             f"strategy={name} with setup={here}: it is for setup={there} alone; type that, or "
             "another strategy"

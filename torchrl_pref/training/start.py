@@ -7,9 +7,9 @@ from functools import partial
 
 import torch
 
-from torchrl_pref.build import check_device, make_policy, make_training_env
+from torchrl_pref.build import make_policy, make_training_env
 from torchrl_pref.checkpoints.checkpoint import Checkpoint
-from torchrl_pref.config.memory import sizes_of_parts, steps_and_stages
+from torchrl_pref.config.memory import session_parts, steps_and_stages
 from torchrl_pref.config.sections import Settings
 from torchrl_pref.errors import check_choice, check_seed
 from torchrl_pref.problem import Problem
@@ -31,23 +31,19 @@ def make_trainer(settings: Settings, task: Problem) -> Trainer:
     own = dict(settings["algorithm"])
     learn = ALGORITHMS[check_choice("algorithm", own.pop("name"), tuple(ALGORITHMS))]
     seed = check_seed("seed", settings["seed"])
-    drawn = constants.problems == "drawn"
-    # What a GPU computes at once is best asked at once.
-    parted = not drawn and check_device(settings["device"]).type == "cpu"
-    here, *others = sizes_of_parts(constants.sessions, constants.processes if parted else 1)
+    here, *others = session_parts(settings)
     env = make_training_env(settings, task, task.train, here, seed)
     # The policy's initial weights come from the global generator.
     torch.manual_seed(seed)
     policy = make_policy(settings, env)
     algorithm = learn(policy, constants, **own)
-    if drawn:
+    if constants.problems == "drawn":
         return Trainer(DrawnSessions(settings, policy, env, seed), algorithm, seed)
     steps, stages = steps_and_stages(constants.steps, constants.stages, env.max_steps)
     sessions = Sessions(env, policy, steps, stages)
+    # No more goes to another process.
     pool = replace(task.train, trajectories=None)
-    asked = replace(
-        task, train=pool, test=pool
-    )  # what goes to another process is no more than that
+    asked = replace(task, train=pool, test=pool)
     makes = [
         partial(make_part, settings, asked, steps, stages, size, seeds_of_part(seed, part))
         for part, size in enumerate(others, start=1)

@@ -119,6 +119,7 @@ def served(study: Study, port: int = 0) -> Iterator[str]:
     with socket.socket() as listening:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listening.bind(("127.0.0.1", port))
+        listening.listen()  # so that a page asked for at once waits, and is not refused
         host = f"127.0.0.1:{listening.getsockname()[1]}"
         config = uvicorn.Config(
             make_app(study, ("127.0.0.1",), None), log_level="error", lifespan="off"

@@ -329,8 +329,9 @@ def main() -> None:
         opener.stop()
     counts["all"] = sum(counts.values(), Counter())
     rows = [{"files": name, **{c: found[c] for c in COLUMNS}} for name, found in counts.items()]
-    common.report("What became of bad files", rows, options.json)
-    print(f"{time.perf_counter() - start:.0f} s, at most {most / 2**20:.0f} MiB for a file")
+    title = f"What became of bad files; at most {most / 2**20:.0f} MiB for one"
+    common.report(title, rows, options.json)
+    print(f"{time.perf_counter() - start:.0f} s")
     bad = sum(counts["all"][column] for column in COLUMNS if column not in GOOD)
     if bad or counts["all"]["tried"] < 650:
         raise SystemExit(1)

@@ -18,7 +18,6 @@ from pathlib import Path
 ROOT = Path(__file__).parent.parent
 sys.path[0] = str(ROOT)  # not benchmarks, whose select.py would be found before Python's own
 
-import argparse
 import collections
 import contextlib
 import functools
@@ -40,6 +39,8 @@ from typing import Any, NamedTuple
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+from benchmarks import common
+
 LIMIT_S, LIMIT_BYTES = 60, 4 * 10**9
 """Of each command: seconds, and bytes beyond what the warm process holds."""
 
@@ -47,6 +48,14 @@ STARTED = 77
 """Status of a command that was stopped where its work would start."""
 
 FAULTS = ("traceback", "more than one line", "hang", "crash", "left files")
+
+COLUMNS = {
+    "refused in one line": "refused",
+    "legal, stopped where work starts": "started",
+    "answered, as --help is": "answered",
+    **{fault: fault for fault in FAULTS},
+}
+"""Of the table, and which outcome each counts."""
 
 ANY = ["null", "true", "word", "WORD", "''", "' '", "'null'", "[]", "[1,2]", "[[1]]", "{}", "{a:1}"]
 ANY += ["ω", "'a b'", '"quoted"', "a'b", "a=b", "x" * 5000, "[" * 300, "${seed}", "${nosuch}", "${"]
@@ -404,7 +413,7 @@ def agrees(result: Result) -> bool:
 
 def main() -> None:
     """Run them, count what became of them, and run some again."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser = common.arguments(__doc__)
     parser.add_argument("--sample", type=int, help="how many, at random; by default all")
     parser.add_argument("--seed", type=int, default=0, help="of the sample (default 0)")
     parser.add_argument("--apart", type=int, default=20, help="run again as processes (default 20)")
@@ -421,9 +430,8 @@ def main() -> None:
                 line = shlex.join([f"{script}.py", *arguments])
                 print(f"{result.outcome}: {line[:300]}\n    {result.errors[-600:]!r}", flush=True)
     counts = collections.Counter(result.outcome for result in results)
-    print(f"{len(results)} commands")
-    for outcome in ("refused", "started", "answered", *FAULTS):
-        print(f"{counts[outcome]:6} {outcome}")
+    row = {"tried": len(results), **{name: counts[which] for name, which in COLUMNS.items()}}
+    common.report(f"{len(results)} of {len(every_command())} wrong commands", [row], typed.json)
     refused = [result for result in results if result.outcome == "refused"]
     again = luck.sample(refused, min(typed.apart, len(refused)))
     differing = [result for result in again if not agrees(result)]

@@ -147,6 +147,11 @@ def report(title: str, rows: Sequence[Row], json_path: Path | None) -> None:
         print(f"\nwritten to {json_path}")
 
 
+def second(json_path: Path | None, name: str) -> Path | None:
+    """Where a benchmark's second table goes: beside its first one, with a name of its own."""
+    return None if json_path is None else json_path.with_stem(f"{json_path.stem}-{name}")
+
+
 def normalised_pool(n_queries: int = 1000) -> QueryPool:
     """The default Gridworld pool, normalised."""
     pool = gridworld_pool(n_queries)

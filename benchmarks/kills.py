@@ -17,7 +17,6 @@ from pathlib import Path
 ROOT = Path(__file__).parent.parent
 sys.path[0] = str(ROOT)  # and not this folder, whose select.py would hide Python's own
 
-import argparse
 import csv
 import itertools
 import json
@@ -36,11 +35,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from tabulate import tabulate
 
 import torchrl_pref.evaluation.reports  # forked processes need not import these
 import torchrl_pref.training.start  # noqa: F401
 import train  # noqa: F401
+from benchmarks import common
 from torchrl_pref.checkpoints.checkpoint import Checkpoint
 from torchrl_pref.training.progress import Progress
 
@@ -299,16 +298,27 @@ class Trials:
         """The table."""
         for kind, counts in self.counts.items():
             outcomes = [f"{n} {name}" for name, n in counts.items() if name not in KEPT]
-            yield {"kind": kind, "trials": counts["trials"], "of them": ", ".join(sorted(outcomes))}
-            yield {"kind": "", "trials": "", "of them": f"{counts['wrong']} lost or mixed"}
+            yield {
+                "kind": TITLES.get(kind, kind),
+                "trials": counts["trials"],
+                "of them": ", ".join(sorted(outcomes)),
+                "lost or mixed": counts["wrong"],
+            }
 
 
 KEPT = ("trials", "wrong")
 
+TITLES = {
+    "SIGKILL": "SIGKILL at a random moment",
+    "write": "SIGKILL when a file is written and not yet named",
+    "SIGTERM": "SIGTERM at a random moment",
+    "evaluation": "SIGKILL in the evaluation",
+}
+
 
 def main() -> None:
     """All trials, and the table."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser = common.arguments(__doc__)
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--starts", type=int, default=20, help="double starts")
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
@@ -333,7 +343,7 @@ def main() -> None:
                 trials.start_twice(resume=number % 3 == 1)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
-    print(tabulate(list(trials.rows()), headers="keys"))
+    common.report("Runs that were killed, or started twice", list(trials.rows()), typed.json)
     print(f"\n{time.perf_counter() - begun:.0f} s, seed {typed.seed}")
     for text in trials.wrong:
         print(f"\nWRONG: {text}", file=sys.stderr)

@@ -43,8 +43,9 @@ def main() -> None:
         omega, evidence = asked(model, options.humans, n_features, n_answers)
         for belief in (Belief(model), LaplaceBelief(model)):
             samples = after(belief, evidence, n_features)
-            kind = type(belief).__name__
-            rows.append({"D": n_features, "H": n_answers, "belief": kind, **judged(samples, omega)})
+            kind = "laplace" if isinstance(belief, LaplaceBelief) else "sampled"
+            row = {"D": n_features, "answers": n_answers, "belief": kind}
+            rows.append({**row, **judged(samples, omega)})
     common.report(f"Random questions, tau {TAU}, {options.humans} humans", rows, options.json)
     costs = []
     for n_features, n_answers in LARGE:
@@ -53,9 +54,10 @@ def main() -> None:
         update = partial(after, belief, evidence, n_features)
         seconds = common.paired({"update": update}, options.repeats)["update"]
         cosine = torch.cosine_similarity(update().mean(1), omega).mean()
-        cost = {"D": n_features, "H": n_answers, "ms an update": 1e3 * seconds}
+        cost = {"D": n_features, "answers": n_answers, "ms an update": 1e3 * seconds}
         costs.append({**cost, "cosine of the mean": float(cosine)})
-    common.report("The Gaussian belief, one session", costs, None)
+    title = "The Gaussian belief, one session"
+    common.report(title, costs, common.second(options.json, "cost"))
 
 
 def asked(

@@ -22,6 +22,7 @@ sys.path[0] = str(Path(__file__).resolve().parents[1])  # this folder's select.p
 import csv
 import math
 import random
+import statistics
 import time
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -46,16 +47,17 @@ from torchrl_pref.questions.responses import Boltzmann, Optimal
 
 BOUND = 0.02
 
-KINDS = (
-    "random",
-    "greedy",
-    "surprising",
-    "contradictory",
-    "60 answers",
-    "gaps of 1e-4",
-    "gaps of 1e3",
-    "collinear",
-)
+TITLES = {
+    "random": "random",
+    "greedy": "greedy",
+    "surprising": "each answer the least likely",
+    "contradictory": "one question answered otherwise",
+    "60 answers": "60 answers",
+    "gaps of 1e-4": "gaps of 10⁻⁴",
+    "gaps of 1e3": "gaps of 10³",
+    "collinear": "nearly collinear",
+}
+KINDS = tuple(TITLES)
 """Of histories: questions and answers drawn as a human would give them; questions of highest
 information gain; each answer the least likely one; one question asked again and answered otherwise;
 many answers; tiny and huge features; features that nearly follow from each other."""
@@ -116,15 +118,11 @@ def main() -> None:
         done = zip(cases, tqdm(jobs, total=len(cases), unit="case"), strict=True)
         results = dict(done if options.csv is None else _written(done, options.csv))
     if options.drawn is None:
-        title = f"Worst of the cases, K = {options.options}"
+        title = f"Worst of {len(results)} cases, standard errors in brackets"
         common.report(title, list(_worst(results)), options.json)
-    beyond = [
-        {**case._asdict(), **measured._asdict()}
-        for case, measured in results.items()
-        if _is_beyond(measured)
-    ]
-    path = None if options.drawn is None else options.json
-    common.report(f"Beyond {BOUND}: {len(beyond)} of {len(results)} cases", beyond, path)
+    beyond = list(_beyond(results))
+    title = f"{len(beyond)} of {len(results)} cases beyond {BOUND}, standard errors in brackets"
+    common.report(title, beyond, common.second(options.json, "beyond"))
 
 
 def _written(done: Iterable[tuple[Case, Measured]], path: Path) -> Iterator[tuple[Case, Measured]]:
@@ -141,20 +139,41 @@ def _written(done: Iterable[tuple[Case, Measured]], path: Path) -> Iterator[tupl
 
 
 def _worst(results: dict[Case, Measured]) -> Iterator[common.Row]:
-    """A row for each number of features and kind of history."""
-    for size, kind in product(sorted({case.features for case in results}), KINDS):
-        some = [m for case, m in results.items() if (case.features, case.kind) == (size, kind)]
+    """A row for each kind of history: the worst of all cases, with standard errors in brackets."""
+    sizes = sorted({case.features for case in results})
+    for kind in KINDS:
+        some = {case: m for case, m in results.items() if case.kind == kind}
+        biased = max(some.values(), key=lambda m: m.bias)
+        narrow, *_, wide = sorted(some.values(), key=lambda m: m.variance)
+        times = [
+            f"{statistics.mean(m.milliseconds for c, m in some.items() if c.features == size):.1f}"
+            for size in sizes
+        ]
         yield {
-            "D": size,
-            "history": kind,
-            "bias": max(m.bias for m in some),
-            "(se)": max(m.bias_error for m in some),
-            "variance, least": min(m.variance for m in some),
-            "largest": max(m.variance for m in some),
-            "(se) ": max(m.variance_error for m in some),
-            "ESS, least": min(m.effective for m in some),
-            "ms an update": sum(m.milliseconds for m in some) / len(some),
+            "history": TITLES[kind],
+            "bias": f"{biased.bias:.3f} ({biased.bias_error:.3f})",
+            "variance, least": f"{narrow.variance:.3f} ({narrow.variance_error:.3f})",
+            "variance, largest": f"{wide.variance:.3f} ({wide.variance_error:.3f})",
+            "least effective size": round(min(m.effective for m in some.values())),
+            f"ms an update, D = {' / '.join(map(str, sizes))}": " / ".join(times),
         }
+
+
+def _beyond(results: dict[Case, Measured]) -> Iterator[common.Row]:
+    """A row for each case that is beyond the bound."""
+    for case, m in results.items():
+        if _is_beyond(m):
+            yield {
+                "D": case.features,
+                "K": case.options,
+                "tau": "optimal" if case.tau is None else case.tau,
+                "history": THEN.join(TITLES[kind] for kind in case.kind.split(THEN)),
+                **({"seed": case.seed} if case.seed else {}),
+                "bias": f"{m.bias:.3f} ({m.bias_error:.3f})",
+                "variance": f"{m.variance:.3f} ({m.variance_error:.3f})",
+                "effective size": round(m.effective),
+                "reported": round(m.reported),
+            }
 
 
 def _is_beyond(measured: Measured) -> bool:

@@ -76,8 +76,8 @@ def main() -> None:
                 foreseen.setdefault(kind, []).append(predicted(*last, belief, factor))
             for other in ("told wrongly", "told rightly"):
                 gain = (found["inferred"] - found[other])[:, -1]
-                row[f"less {other}"] = float(gain.mean())
-                row["± " + other.split()[1]] = float(gain.std() / len(gain) ** 0.5)
+                error = float(gain.std() / len(gain) ** 0.5)
+                row[f"less {other}"] = f"{float(gain.mean()):+.3f} ± {error:.3f}"
             cosines.append(row)
         for kind, each in inside.items():
             shares = torch.stack(each).mean(0).tolist()
@@ -87,7 +87,8 @@ def main() -> None:
             covered.append({**of, **levels, "calibration error": error})
     title = f"Cosine of the mean after {BUDGET} answers, {options.humans} humans a row"
     common.report(title, cosines, options.json)
-    common.report("Coverage of central intervals, and calibration of answers", covered, None)
+    title = "How often central intervals hold the human's return, and calibration of answers"
+    common.report(title, covered, common.second(options.json, "coverage"))
     if options.plot:
         draw(covered, options.plot)
 

@@ -1,8 +1,8 @@
 """What the parts of a session cost, beside an earlier version of this package.
 
-``git worktree add ../earlier 672a7d5`` (version 0.1.0), then ``python benchmarks/versions.py
-../earlier``. Each version is measured in processes of its own, in turn; the least CPU time of all
-repetitions counts, as whatever else the machine does only adds to it.
+``python benchmarks/versions.py 672a7d5`` (version 0.1.0; any commit). Each version is measured in
+processes of its own, in turn; the least CPU time of all repetitions counts, as whatever else the
+machine does only adds to it.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ sys.path[0] = os.getcwd() if MEASURE in sys.argv else str(Path(__file__).resolve
 import inspect
 import json
 import subprocess
+import tempfile
 import time
 from collections.abc import Callable
 
@@ -30,15 +31,16 @@ from benchmarks import common
 def main() -> None:
     """Print the table."""
     parser = common.arguments(__doc__)
-    parser.add_argument("earlier", type=Path, help="a checkout of the earlier version")
+    parser.add_argument("earlier", help="the commit of the earlier version")
     options = common.start(parser)
-    folders = {"earlier": options.earlier.resolve(), "now": Path(sys.path[0])}
-    least: dict[str, dict[str, float]] = {version: {} for version in folders}
-    for _ in range(options.repeats // 3):
-        for version, folder in folders.items():
-            for name, seconds in measured_in(folder).items():
-                before = least[version].get(name, seconds)
-                least[version][name] = min(before, seconds)
+    now = Path(sys.path[0])
+    with tempfile.TemporaryDirectory() as scratch:
+        git = ["git", "-C", str(now), "archive", options.earlier]
+        archive = subprocess.run(git, capture_output=True, check=False)
+        if archive.returncode != 0:
+            parser.error(f"{options.earlier}: {archive.stderr.decode().strip()}")
+        subprocess.run(["tar", "-x", "-C", scratch], input=archive.stdout, check=True)
+        least = measured({"earlier": Path(scratch), "now": now}, options.repeats // 3)
     rows: list[common.Row] = [
         {
             "CPU ms": name,
@@ -48,7 +50,19 @@ def main() -> None:
         }
         for name, seconds in least["now"].items()
     ]
-    common.report("Two versions in turn, D = 4, K = 2, M = 100", rows, options.json)
+    title = f"Beside commit {options.earlier}, in turn, D = 4, K = 2, M = 100"
+    common.report(title, rows, options.json)
+
+
+def measured(folders: dict[str, Path], repeats: int) -> dict[str, dict[str, float]]:
+    """The least CPU seconds of each part, by version."""
+    least: dict[str, dict[str, float]] = {version: {} for version in folders}
+    for _ in range(repeats):
+        for version, folder in folders.items():
+            for name, seconds in measured_in(folder).items():
+                before = least[version].get(name, seconds)
+                least[version][name] = min(before, seconds)
+    return least
 
 
 def measured_in(folder: Path) -> dict[str, float]:

@@ -18,7 +18,8 @@ from omegaconf import OmegaConf
 from test_cli import keys_of
 
 import typed
-from benchmarks import docs_figures, docs_tables
+from benchmarks import docs_figures, docs_records, docs_tables
+from benchmarks.docs_parts import PARTS
 from benchmarks.planted import FAULTS, Fault
 from torchrl_pref.config.settings import check_evaluate_settings, check_train_settings
 from torchrl_pref.config.study import check_ask_settings
@@ -195,7 +196,7 @@ def test_every_table_between_marks_is_made_by_a_part() -> None:
         text = page.read_text()
         begun, ended = (re.findall(rf"^<!-- {end}: (\S+) -->$", text, re.M) for end in ENDS)
         assert begun == ended
-        parts = [part for part, made in docs_figures.PARTS.items() if ROOT / made.page == page]
+        parts = [part for part, made in PARTS.items() if ROOT / made.page == page]
         assert {mark.partition("-")[0] for mark in begun} <= set(parts)
     with pytest.raises(ValueError, match="no <!-- begin: nothing -->"):
         docs_figures.between("", "nothing", "")
@@ -203,9 +204,9 @@ def test_every_table_between_marks_is_made_by_a_part() -> None:
     assert docs_figures.between(page, "x", "new") == page.replace("old", "new")
 
 
-@pytest.mark.parametrize("name", docs_figures.PARTS)
+@pytest.mark.parametrize("name", PARTS)
 def test_parts_of_the_docs_are_made_by_commands_that_are_accepted(name: str) -> None:
-    for line in docs_figures.PARTS[name].commands:
+    for line in PARTS[name].commands:
         command, _, left = line.partition(" -> ")
         assert left
         script = ROOT / command.split()[1]
@@ -240,7 +241,7 @@ def test_the_gallery_shows_a_file() -> None:
     assert features is not None
     for feature in re.findall(r'"(\w+)"', features[1]):
         assert f"| {feature} |" in section
-    made = [line.rpartition(" -> ")[2] for line in docs_figures.PARTS["gallery"].commands]
+    made = [line.rpartition(" -> ")[2] for line in PARTS["gallery"].commands]
     assert made[-2:] == ["pendulum.csv", "files.png"]
 
 
@@ -254,7 +255,7 @@ def test_a_cell_of_the_protocol_is_a_table() -> None:
         entries += [
             Entry("heldout", "query/noisy/corners", pool, 0, key, values) for pool in ("0", "1")
         ]
-    greedy, policy = docs_tables.heldout_rows(Records(entries))
+    greedy, policy = docs_records.heldout_rows(Records(entries))
     assert greedy["RL minus it, after 4"] == "+0.100 [+0.100, +0.100]"
     assert greedy["strategy"].endswith("3 humans a pool")
     assert policy["strategy"] == "**RL**"

@@ -244,6 +244,7 @@ PARTS: dict[str, Part] = {
         "room_finer", "docs/strategies.md", 8, '--pools 16 --only "D=8;tau unknown"', "room"
     ),
     "room_feed": benchmark("room_feed", "docs/strategies.md", 40, "--setup feed", "room"),
+    "room_kinds": benchmark("room_kinds", "docs/strategies.md", 35, "--humans 60"),
     "large_pool": benchmark("large_pool", "docs/speed.md", 3),
     "aprel": Part(
         "docs/aprel.md",

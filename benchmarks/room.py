@@ -22,7 +22,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[0] = str(ROOT)  # and not this folder, whose select.py would hide Python's own
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -166,10 +166,11 @@ class Found:
     """Alignment of each strategy with the humans of all pools (pools · B, H)."""
 
     curves: dict[str, list[Tensor]] = field(default_factory=dict)
+    baseline: str = BASELINE
 
     def more(self, name: str, pools: slice = slice(None)) -> tuple[float, float]:
         """How much more a strategy is than the baseline in the mean over questions, and ±."""
-        own, base = (torch.cat(self.curves[each][pools]).mean(1) for each in (name, BASELINE))
+        own, base = (torch.cat(self.curves[each][pools]).mean(1) for each in (name, self.baseline))
         return float((own - base).mean()), 2 * float((own - base).std()) / len(base) ** 0.5
 
 
@@ -273,16 +274,16 @@ def row_of_policies(name: str, found: Found) -> common.Row:
     return row
 
 
-def row_of(name: str, setup: str, found: Found) -> common.Row:
-    """What is told of a corner."""
+def row_of(name: str, found: Found, tried: Sequence[str]) -> common.Row:
+    """What is told of a corner: how much more each thing that was tried is than the baseline."""
     best = max(found.curves, key=lambda each: found.more(each, slice(0, None, 2))[0])
     room, error = found.more(best, slice(1, None, 2))
     told = {each: f"{found.more(each)[0]:+.3f}" for each in found.curves}
     return {
         "corner": name,
-        "alignment": float(torch.cat(found.curves[BASELINE]).mean()),
-        **{each: told.get(each, "") for each in TRIED[setup]},
-        "±": found.more("mixed")[1],
+        "alignment": float(torch.cat(found.curves[found.baseline]).mean()),
+        **{each: told.get(each, "") for each in tried if each != found.baseline},
+        "±": found.more(tried[0])[1],
         "room": f"{room:+.3f} ± {error:.3f}" if room > error else "none seen",
         "by": best if room > error else "",
     }
@@ -308,7 +309,8 @@ def main() -> None:
     for name in tqdm(names, desc="corners"):
         corner = replace(Corner(), **corners[name])
         found = measure(corner, typed.setup, typed.pools, typed.humans, policies)
-        rows.append(row_of_policies(name, found) if policies else row_of(name, typed.setup, found))
+        tried = TRIED[typed.setup]
+        rows.append(row_of_policies(name, found) if policies else row_of(name, found, tried))
     title = "Mean alignment over all questions: expected alignment, and what others are more"
     common.report(title, rows, typed.json)
 

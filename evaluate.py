@@ -195,7 +195,8 @@ def evaluate_taus(
     for task, _ in tasks:
         comparison.try_strategies(own, settings, task)
     for task, learned in tasks:
-        records.entries += comparison.evaluate_task(settings, task, learned, own=own).entries
+        for found in comparison.evaluate_misjudged(settings, task, learned, own=own):
+            records.add(found)
     return records
 
 
@@ -331,7 +332,8 @@ def evaluate_checkpoints(settings: Settings, paths: list[Path]) -> tuple[Records
         comparison.try_strategies(own, its_settings, task)
     records, trained = Records(), []
     for (its_settings, task, learned), test in zip(groups, tests, strict=True):
-        records.entries += comparison.evaluate_task(its_settings, task, learned, test, own).entries
+        for found in comparison.evaluate_misjudged(its_settings, task, learned, test, own):
+            records.add(found)
         for key, checkpoint in learned.items():
             trained.append(Training(key, task.title, Progress.of(checkpoint.training)))
     return records, trained

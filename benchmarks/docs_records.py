@@ -273,6 +273,7 @@ def metrics(folder: Path) -> dict[str, str]:
         rows = []
         for belief, what in BELIEFS.items():
             records = read_records(folder / f"{belief}_{spread}" / CSV)
+            records = records.of_task(records.tasks[0])  # and not of a belief that is right
             row = {"belief": what}
             for name in (*VALUES, *METRICS):
                 values = measured(records, RULES[0], name)[..., -1]

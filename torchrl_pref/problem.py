@@ -5,7 +5,7 @@ Shapes: N queries, K options per query, D features.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -83,11 +83,17 @@ class Problem:
             who = f"{who}, {human.kind}"
         if type(self.question) is not Choice:
             who = f"{who}, {named(self.question)}"
-        if not human.kind and (human.tau, human.lapse) == (self.tau, self.belief_lapse):
+        if not self.misjudges:
             return who
         assumed = "optimal" if self.tau is None else f"tau={self.tau:.4g}"
         beside = f", lapse={self.belief_lapse:g}" if self.belief_lapse else ""
         return f"{who}; assumed {assumed}{beside}"
+
+    @property
+    def misjudges(self) -> bool:
+        """Whether the belief takes the human for another than they are."""
+        human = self._human
+        return bool(human.kind) or (human.tau, human.lapse) != (self.tau, self.belief_lapse)
 
     @property
     def response_model(self) -> ResponseModel:
@@ -98,6 +104,15 @@ class Problem:
     def human_model(self) -> ResponseModel:
         """How the human answers."""
         return model_of(self._human.tau, self.question, self._human.lapse)
+
+    def judging_rightly(self) -> Problem:
+        """The same where the belief is right: it is told the tau and the lapses of the human. Of a
+        human who differs in more, or whose tau it infers or cannot be told, it meets the one whom
+        it expects."""
+        human = self._human
+        if human.kind or self.infers or human.tau is None:
+            return replace(self, human=Human(self.tau, self.belief_lapse))
+        return replace(self, tau=human.tau, belief_lapse=human.lapse)
 
     @property
     def _human(self) -> Human:

@@ -48,6 +48,9 @@ RELIABILITY = tuple(f"{part}_in_bin_{place}" for part in PARTS for place in rang
 """Sums over all humans after the last answer, see ``metrics.reliability``."""
 
 
+COMPARISON, MISJUDGED, REFERENCE = "comparison", "misjudged", "reference"
+"""Protocols, see :class:`Entry`."""
+
 AT_ONCE = "asked_at_once"
 """How many queries a strategy asked at once, where it was more than one."""
 
@@ -57,7 +60,8 @@ class Entry:
     """What one strategy did on one pool, once.
 
     Attributes:
-        protocol: ``comparison`` or ``heldout``.
+        protocol: ``comparison`` or ``heldout``; ``misjudged`` is a comparison with a human whom the
+            belief takes for another, and ``reference`` what that is held against.
         task: which kind of human, and where there are several, of setup and features.
         pool: which queries.
         seed: of the policy's training, or the number of the run of a baseline.
@@ -94,6 +98,23 @@ class Records:
     def tasks(self) -> list[str]:
         """The tasks, in order."""
         return list(dict.fromkeys(entry.task for entry in self.entries))
+
+    def reference_of(self, task: str) -> str | None:
+        """The task on the same pool in which the belief is right about the human: the next such
+        one, or else the last; None where it is right anyhow."""
+        own = self.of_task(task).entries[0]
+        if own.protocol != MISJUDGED:
+            return None
+        alike = [e for e in self.entries if e.protocol == REFERENCE and e.pool == own.pool]
+        found = list(dict.fromkeys(entry.task for entry in alike))
+        tasks = self.tasks
+        later = (other for other in found if tasks.index(other) > tasks.index(task))
+        return next(later, found[-1] if found else None)
+
+    def add(self, others: Records) -> None:
+        """Take in the tasks that are not there yet."""
+        there = set(self.tasks)
+        self.entries += [entry for entry in others.entries if entry.task not in there]
 
     @property
     def strategies(self) -> list[str]:

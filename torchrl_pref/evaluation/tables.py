@@ -10,7 +10,7 @@ from collections.abc import Callable
 from tabulate import tabulate
 from torch import Tensor
 
-from torchrl_pref.evaluation.metrics import METRICS
+from torchrl_pref.evaluation.metrics import ALWAYS, METRICS
 from torchrl_pref.evaluation.records import Records
 from torchrl_pref.evaluation.style import (
     LEARNED,
@@ -46,7 +46,7 @@ def tables(records: Records) -> str:
         if any(map(is_judged, own.strategies)):
             parts += ["differences on the same humans [95%]", "", difference_table(own), ""]
         parts += ["after the last query", "", detail_table(own), ""]
-        parts += [*few_samples(own), *many_repeats(own)]
+        parts += [*misjudging(records, task), *few_samples(own), *many_repeats(own)]
     return "\n".join(parts)
 
 
@@ -133,6 +133,30 @@ def detail_table(records: Records, style: str = "simple") -> str:
                 row[header] = show(measured(records, key, metric)) if there else ""
         rows.append(row)
     return tabulate(rows, headers="keys", tablefmt=style, disable_numparse=True)
+
+
+def misjudging(records: Records, task: str) -> list[str]:
+    """What it costs that the belief takes the human for another."""
+    reference = records.reference_of(task)
+    if reference is None:
+        return []
+    own, right = records.of_task(task), records.of_task(reference)
+    rows = []
+    for key in own.strategies:
+        row = {"strategy": name_of(key)}
+        for metric in ALWAYS:
+            mine, others = (measured(each, key, metric)[..., -1] for each in (own, right))
+            mean, *ends = mean_and_interval(mine - others)
+            head = METRICS[metric].head
+            row[head] = f"{mine.mean():.3f}"
+            row[f"{head}, minus rightly [95%]"] = signed(mean, (ends[0], ends[1]))
+        if own.has(key, "calibration") and right.has(key, "calibration"):
+            errors = (measured(each, key, "calibration")[..., -1].mean() for each in (own, right))
+            row["calibration"], row["calibration, rightly"] = (f"{error:.3f}" for error in errors)
+        rows.append(row)
+    table = tabulate(rows, headers="keys", tablefmt="simple", disable_numparse=True)
+    what = "what misjudging the human costs, after the last query; beside"
+    return [f"{what} {title_of(reference)}", "", table, ""]
 
 
 REFERENCES = ("greedy_information", "quantile_information")

@@ -291,6 +291,7 @@ def test_what_is_no_answer_changes_nothing(answer: Any, generator: Generator) ->
         {"repeats": 0},
         {"response_model": "Boltzmann(tau=4)"},
         {"asked": [50]},
+        {"answer": [[0], [1]]},
     ],
 )
 def test_spoiled_sessions_are_refused(spoil: dict[str, Any], generator: Generator) -> None:

@@ -65,5 +65,10 @@ def check_content(content: Any) -> None:
                 f"{key} of a session is {content.get(key, 'missing')!s:.60}: expected what "
                 f"Session.to_dict() makes, in its format {FORMAT}"
             )
+    if unknown := sorted(map(str, content.keys() - checks.keys())):
+        raise InputError(
+            f"{unknown[0]:.60} of a session: no such key; expected what Session.to_dict() makes, "
+            f"in its format {FORMAT}"
+        )
     if len(content["queries"]) != len(content["answers"]):
         raise InputError("a session with a query too many or an answer: expected as many of each")

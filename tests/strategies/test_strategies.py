@@ -18,6 +18,7 @@ from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.errors import InputError
 from torchrl_pref.pool import QueryPool
 from torchrl_pref.questions.response_model import Prediction, ResponseModel
+from torchrl_pref.questions.responses import Boltzmann, Optimal
 from torchrl_pref.strategies import (
     FEED_STRATEGIES,
     STRATEGIES,
@@ -263,6 +264,21 @@ def test_thompson_asks_what_two_drawn_samples_have_most_at_stake_about(pool: Que
         assert int(chosen["action"][b]) in stakes
         asked.append(int(chosen["action"][b]))
     assert len(set(asked)) > 5
+
+
+@pytest.mark.parametrize("model", [Boltzmann(0.001), Boltzmann(1e5), Optimal()], ids=str)
+def test_thompson_cares_about_returns_alone(model: ResponseModel, pool: QueryPool) -> None:
+    """Not about tau, nor about the order of options; where all are alike it asks the first."""
+    env = make(QueryEnv, pool, model, batch=30)
+    session = session_of(env)
+    chosen = STRATEGIES["thompson"](env)(session.clone())["action"]
+    turned, alike = session.clone(), session.clone()
+    turned["queries"] = turned["queries"].flip(2)
+    alike["queries"] = alike["queries"][:, :, :1].expand_as(alike["queries"])
+    assert torch.equal(STRATEGIES["thompson"](env)(turned)["action"], chosen)
+    assert (STRATEGIES["thompson"](env)(alike)["action"] == 0).all()
+    other = make(QueryEnv, pool, Boltzmann(2.0), batch=30)
+    assert torch.equal(STRATEGIES["thompson"](other)(session.clone())["action"], chosen)
 
 
 @pytest.mark.parametrize("name", ["thompson", "knowledge_gradient", "max_regret"])

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from PIL import Image, ImageChops, ImageDraw
+from PIL import ExifTags, Image, ImageChops, ImageDraw
 from recordings import DATASET, write_csv, write_minari
 
 from torchrl_pref.errors import InputError
@@ -20,6 +20,7 @@ from torchrl_pref.tasks.__main__ import main
 from torchrl_pref.tasks.base import make_pool
 from torchrl_pref.tasks.drawing import save_animation, save_picture
 from torchrl_pref.tasks.gridworld import WALKER, GridworldTask
+from torchrl_pref.tasks.images import Images
 from torchrl_pref.tasks.scene import Disc, Label, Line, Patch, Picture, Scene
 from torchrl_pref.tasks.sheet import columns_of, contact_sheet, sheet, widened
 
@@ -127,6 +128,21 @@ def test_images_keep_their_shape(size: tuple[int, int], tmp_path: Path) -> None:
         assert abs(box.width / box.height / (across / up) - 1) < 1e-6
         assert drawn.axes is not None
         assert drawn.axes.bbox.padded(1e-6).get_points().tolist()[0] <= box.get_points().tolist()[0]
+
+
+def test_photographs_stand_upright(tmp_path: Path) -> None:
+    """A camera that was turned says so in the file (EXIF), and a browser turns the image back."""
+    turned = Image.new("RGB", (320, 80), "white")
+    turned.paste("blue", (0, 0, 160, 80))
+    tags = Image.Exif()
+    tags[ExifTags.Base.Orientation] = 6  # its left is up
+    turned.save(tmp_path / "a.jpg", exif=tags)
+    picture = Picture(str(tmp_path / "a.jpg"))
+    assert Images().aspect(picture) == 320 / 80
+    seen = Images().at(picture, 0).convert("RGB")
+    assert seen.size == (80, 320)
+    blue, white = (seen.getpixel((40, y)) for y in (20, 300))
+    assert blue[0] < 40 < 215 < white[0]
 
 
 def test_the_shape_of_a_panel_is_that_of_its_images(tmp_path: Path) -> None:

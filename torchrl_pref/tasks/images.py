@@ -13,7 +13,7 @@ from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
-from PIL import Image
+from PIL import Image, ImageOps
 
 from torchrl_pref.errors import InputError
 from torchrl_pref.tasks.scene import Picture, Scene, Shape
@@ -61,6 +61,7 @@ class Images:
             if image is None:
                 file = io.BytesIO(Path(path).read_bytes())
                 image = Image.open(file, formats=("PNG", "JPEG", "GIF"))
+                ImageOps.exif_transpose(image, in_place=True)  # upright, as a browser shows it
                 if _count(image) > 1:
                     self._animated[path] = image
             yield image

@@ -147,6 +147,23 @@ def test_transforms_that_take_keys_away_work(kind: type, transform: Any, pool: Q
 
 
 @pytest.mark.parametrize("kind", ENVS)
+def test_humans_are_not_there_to_be_excluded(kind: type, pool: QueryPool) -> None:
+    with pytest.raises(KeyError, match="human not found"):
+        TransformedEnv(make(kind, pool, **free(kind)), ExcludeTransform("human")).rollout(2)
+
+
+@pytest.mark.parametrize("kind", ENVS)
+def test_a_compact_collector_leaves_out_what_comes_again(kind: type, pool: QueryPool) -> None:
+    env = make(kind, pool, batch=2, **free(kind))
+    shown = set(env.observation_spec.keys())
+    for compact in (True, False):
+        options = {**COLLECTED, "frames_per_batch": 8, "total_frames": 8}
+        (batch,) = Collector(env, coin(env), compact_obs=compact, **options)
+        assert bool(shown & set(batch["next"].keys()) - {"session"}) != compact
+        assert {"reward", "done", "terminated"} <= set(batch["next"].keys())
+
+
+@pytest.mark.parametrize("kind", ENVS)
 def test_observation_norm_takes_its_statistics_from_rollouts(kind: type, pool: QueryPool) -> None:
     norm = ObservationNorm(in_keys=["mean"], standard_normal=True)
     env = TransformedEnv(make(kind, pool), norm)
@@ -368,6 +385,19 @@ def test_batched_environments_remember_their_humans(kind: type, use_buffers: boo
     finally:
         if not env.is_closed:
             env.close()
+
+
+@pytest.mark.parametrize("kind", [SerialEnv, ParallelEnv])
+def test_a_strategy_respects_the_mask_that_stays_in_the_workers(
+    kind: type, pool: QueryPool
+) -> None:
+    options = {"mp_start_method": "fork"} if kind is ParallelEnv else {}
+    env = kind(2, functools.partial(few, pool), **options)
+    try:
+        asked = env.rollout(5, RandomQuery())["next", "session", "history", "index"][..., -1, :]
+        assert all(len(row.unique()) == 5 for row in asked.flatten(0, 1))
+    finally:
+        env.close()
 
 
 def test_the_same_answers_with_and_without_buffers() -> None:

@@ -11,8 +11,11 @@ from torchrl_pref.beliefs import laplace
 from torchrl_pref.beliefs.base import BeliefBase
 from torchrl_pref.beliefs.laplace import LaplaceBelief, find_mode, rows_there
 from torchrl_pref.beliefs.sampled import Belief, uniform_sphere
+from torchrl_pref.questions.approve import Approve
 from torchrl_pref.questions.base import Evidence
+from torchrl_pref.questions.best_worst import BestWorst
 from torchrl_pref.questions.prior_evidence import evidence_of, joined
+from torchrl_pref.questions.ranking import Ranking
 from torchrl_pref.questions.responses import Boltzmann
 from torchrl_pref.questions.weak import Weak
 
@@ -104,6 +107,39 @@ def test_it_is_near_to_the_samples(n_features: int, generator: Generator) -> Non
     low, high = torch.quantile((samples @ shown).squeeze(-1), torch.tensor([0.1, 0.9]), dim=1)
     true = (omega * shown.squeeze(-1)).sum(-1)
     assert float(((low < true) & (true < high)).float().mean()) == pytest.approx(0.8, abs=0.08)
+
+
+@pytest.mark.parametrize(
+    ("model", "n_features", "n_options", "least"),
+    [
+        (Boltzmann(2.0), 16, 2, 0.76),
+        (Boltzmann(2.0), 64, 2, 0.76),
+        (Boltzmann(2.0, lapse=0.1), 16, 2, 0.72),
+        (Boltzmann(2.0, Weak()), 16, 2, 0.75),
+        (Boltzmann(2.0, Ranking()), 8, 3, 0.77),
+        (Boltzmann(2.0, BestWorst()), 8, 4, 0.77),
+        (Boltzmann(2.0, Approve()), 16, 1, 0.75),
+    ],
+    ids=str,
+)
+def test_calibration(
+    model: Boltzmann, n_features: int, n_options: int, least: float, generator: Generator
+) -> None:
+    """Ranks of ω are even, up to what docs/beliefs.md says: a Gaussian is a little too sure."""
+    sessions, n_answers = 300, 20
+    belief = LaplaceBelief(model, samples=99)
+    omega = uniform_sphere((sessions, n_features), generator)
+    options = torch.randn(sessions, n_answers, n_options, n_features, generator=generator)
+    likely = model((options @ omega[:, None, :, None]).squeeze(-1)).exp()
+    answers = likely.flatten(0, 1).multinomial(1, generator=generator).view(sessions, n_answers)
+    samples, ess = belief.prior(sessions, n_features, generator), torch.full((sessions,), 99.0)
+    samples, _, _ = belief.update(samples, ess, model.evidence(options, answers), generator)
+    ranks = (samples < omega.unsqueeze(1)).sum(1)
+    for rank in ranks.unbind(-1)[:8]:
+        counts = torch.histc(rank.float(), 10, 0, 99)
+        # 9 degrees of freedom: 33.7 is exceeded once in 10,000.
+        assert ((counts - sessions / 10).square() / (sessions / 10)).sum() < 33.7
+    assert least < ((ranks >= 10) & (ranks < 90)).double().mean() < 0.82  # 80%
 
 
 def test_hundreds_of_features(generator: Generator) -> None:

@@ -16,9 +16,13 @@ from torchrl_pref.beliefs.sampled import uniform_sphere
 from torchrl_pref.beliefs.slice import ARC, MAX_SHRINKS, Target, compiled_moves, tensor_moves
 from torchrl_pref.envs.transition import begin, hear, tell
 from torchrl_pref.errors import InputError
+from torchrl_pref.questions.approve import Approve
+from torchrl_pref.questions.best_worst import BestWorst
 from torchrl_pref.questions.prior_evidence import Given, evidence_of
+from torchrl_pref.questions.ranking import Ranking
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.questions.responses import Boltzmann, Optimal
+from torchrl_pref.questions.weak import Weak
 from torchrl_pref.session import Session
 from torchrl_pref.tensors import directions, lengths
 
@@ -40,22 +44,36 @@ def let_in(
     return samples
 
 
-@pytest.mark.parametrize("model", MODELS, ids=str)
-def test_calibration(model: Boltzmann, generator: Generator) -> None:
+CALIBRATED = [
+    (MODELS[0], 3, 2, 500),
+    (MODELS[1], 3, 2, 500),
+    (Boltzmann(2.0, lapse=0.1), 8, 2, 200),
+    (Boltzmann(2.0, Weak(), lapse=0.1), 2, 2, 200),
+    (Boltzmann(2.0, Ranking()), 6, 3, 200),
+    (Boltzmann(2.0, BestWorst(), lapse=0.1), 3, 4, 200),
+    (Boltzmann(2.0, Approve()), 4, 1, 200),
+]
+"""Model, features, options and people."""
+
+
+@pytest.mark.parametrize(("model", "n_features", "n_options", "sessions"), CALIBRATED, ids=str)
+def test_calibration(
+    model: Boltzmann, n_features: int, n_options: int, sessions: int, generator: Generator
+) -> None:
     """Simulation-based calibration of ω and ln tau, for people whom the prior itself makes."""
-    sessions, n_answers, spread = 500, 6, 5.0
+    n_answers, spread = 6, 5.0
     belief = RationalityBelief(model, spread, samples=99)
-    omega = uniform_sphere((sessions, 3), generator)
+    omega = uniform_sphere((sessions, n_features), generator)
     log_s = torch.randn(sessions, generator=generator) * math.log(spread)
     rates = model.lapse * torch.tensor(RATES)
-    shares = torch.tensor(SHARES)
-    rate = rates[shares.multinomial(sessions, replacement=True, generator=generator)][:, None]
-    options = torch.randn(sessions, n_answers, 2, 3, generator=generator)
-    gaps = ((options[:, :, 0] - options[:, :, 1]) @ omega.unsqueeze(-1)).squeeze(-1)
-    first = (1 - rate) * (model.tau * log_s.exp()[:, None] * gaps).sigmoid() + rate / 2
-    answers = (torch.rand(first.shape, generator=generator) > first).long()
+    rate = rates[torch.tensor(SHARES).multinomial(sessions, replacement=True, generator=generator)]
+    options = torch.randn(sessions, n_answers, n_options, n_features, generator=generator)
+    returns = (options @ omega[:, None, :, None]).squeeze(-1) * log_s.exp()[:, None, None]
+    sincere = Boltzmann(model.tau, model.question)(returns).exp()
+    likely = (1 - rate[:, None, None]) * sincere + rate[:, None, None] / sincere.shape[-1]
+    answers = likely.flatten(0, 1).multinomial(1, generator=generator).view(sessions, n_answers)
     samples = let_in(belief, options, answers, generator)
-    ranks = [(directions(samples)[..., d] < omega[:, None, d]).sum(1) for d in range(3)]
+    ranks = [(directions(samples)[..., d] < omega[:, None, d]).sum(1) for d in range(n_features)]
     ranks.append((samples.norm(dim=-1).log() < log_s[:, None]).sum(1))
     for rank in ranks:
         counts = torch.histc(rank.float(), 10, 0, 99)

@@ -123,6 +123,7 @@ PARTS: dict[str, Part] = {
         1,
         docs_tables.gallery,
     ),
+    "authors": benchmark("authors", "docs/gallery.md", 0.5),
     "heldout": Part(
         "docs/results.md",
         (f"{HELDOUT} checkpoint=[{MADE_FOR_IT}] hydra.run.dir={{folder}} -> {CSV}",),

@@ -2,9 +2,8 @@
 
 The task of Sadigh et al. (*Active preference-based learning of reward functions*, RSS 2017) as it
 was released with Bıyık and Sadigh (*Batch active preference-based learning of reward functions*,
-CoRL 2018) and Bıyık et al. (*Asking easy questions*, CoRL 2019). Over 2,000 random drives the
-features that their code gives, some as large as 16, differ from those here by at most 1.1e-14 in
-float64 and 9.1e-6 in float32.
+CoRL 2018) and Bıyık et al. (*Asking easy questions*, CoRL 2019). The features are those that their
+code gives, see ``benchmarks/authors.py``.
 
 Shapes: T = 50 steps of 0.1 s, D = 4 features, ``…`` any leading dimensions. The unit of length is
 the authors' own, in which a lane is 0.17 wide.

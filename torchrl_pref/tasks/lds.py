@@ -3,8 +3,8 @@
 From Bıyık et al. (*Asking easy questions: a user-friendly approach to active reward learning*, CoRL
 2019) and their released code, which sends each of its 15 inputs to all three points. The released
 scales are the spread of the features under those inputs; the three speed features are then one and
-the same. Over 2,000 random motions of either kind the states that their code gives in float64 are
-those here, and the features differ by at most 5.4e-15.
+the same. Under either inputs the features are those that their code gives, see
+``benchmarks/authors.py``.
 
 Shapes: T = 25 steps, D = 6 features, ``…`` any leading dimensions.
 """

@@ -8,7 +8,7 @@ seeds: humans of one pool share it, and policies of one training share that.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
 from typing import Any
@@ -74,17 +74,22 @@ def run_protocol(
     context = get_context("spawn")
     options = workers, context, _start_worker, (allowed(),)
     with spawning(), ProcessPoolExecutor(*options) as executor:
-        closely = [job for job in jobs if job.cell.features in CLOSELY and job.pool == 0]
-        feeds = {job.cell: job for job in closely if job.cell.setup == "feed"}
-        fits = [replace(job, learned={}, own=(), thresholds=THRESHOLDS) for job in feeds.values()]
-        alignments = executor.map(fit_threshold, fits)
-        best = {
-            cell: (THRESHOLDS[int(alignment.argmax())],)
-            for cell, alignment in zip(feeds, alignments, strict=True)
-        }
-        jobs = [replace(job, thresholds=best.get(job.cell, ())) for job in jobs]
+        jobs = _with_thresholds(jobs, executor)
         done = tqdm(executor.map(run_pool, jobs), total=len(jobs), desc="pools", unit="pool")
         return Records([entry for entries in done for entry in entries])
+
+
+def _with_thresholds(jobs: Sequence[Job], executor: Executor) -> list[Job]:
+    """The jobs with the threshold that is best for their feed, where it is looked at closely."""
+    closely = [job for job in jobs if job.cell.features in CLOSELY and job.pool == 0]
+    feeds = {job.cell: job for job in closely if job.cell.setup == "feed"}
+    fits = [replace(job, learned={}, own=(), thresholds=THRESHOLDS) for job in feeds.values()]
+    alignments = executor.map(fit_threshold, fits)
+    best = {
+        cell: (THRESHOLDS[int(alignment.argmax())],)
+        for cell, alignment in zip(feeds, alignments, strict=True)
+    }
+    return [replace(job, thresholds=best.get(job.cell, ())) for job in jobs]
 
 
 def _jobs(

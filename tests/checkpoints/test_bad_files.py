@@ -59,6 +59,18 @@ def test_a_checkpoint_of_impossible_content_is_refused(
     assert outcome(bench, "checkpoint", path) == "refused"
 
 
+def test_a_checkpoint_of_impossible_settings_is_refused(bench: Bench, tmp_path: Path) -> None:
+    content = torch.load(bench.files["checkpoint"], weights_only=True)
+    cases = list(spoil_contents.spoiled_settings(content))
+    assert len(cases) > 400
+    accepted = [
+        case.name
+        for case in cases
+        if outcome(bench, "checkpoint", case.make(tmp_path)) not in ("refused", "harmless")
+    ]
+    assert accepted == []
+
+
 def test_a_pool_of_impossible_content_is_refused(bench: Bench, tmp_path: Path) -> None:
     cases = list(spoil_contents.spoiled_pools())
     assert len(cases) > 20

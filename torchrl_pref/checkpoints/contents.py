@@ -142,8 +142,9 @@ def _check_settings(settings: Any) -> None:
         for key in keys_of(group, settings[group]["name"]):
             _expect(key in settings[group], f"settings.{group}.{key}", "a value")
     _check_types("settings", settings, TOP, (*SECTIONS, *named, *LISTS))
-    for name in LISTS:
-        texts = settings.get(name)
+    lists = {name: settings.get(name) for name in LISTS}
+    lists["evaluation.metrics"] = settings["evaluation"]["metrics"]
+    for name, texts in lists.items():
         fits = type(texts) is list and all(type(text) is str for text in texts)
         _expect(fits, f"settings.{name}", "a list of texts")
 

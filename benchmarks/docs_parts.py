@@ -98,8 +98,14 @@ RULES += ["max_regret", "disagreement", "thompson", "knowledge_gradient"]
 SWEEP = "hydra.sweep.dir={folder}/sweep"
 TWO = "hydra/launcher=joblib hydra.launcher.n_jobs=2"
 CELLS = [f"{setup}-{tau}" for setup in ("feed", "query") for tau in ("noisy", "optimal")]
-MORE = {seed: f"feed-noisy-{seed}" for seed in range(1, SEEDS)}
+MORE = 31
 """Runs of the cell in which one training tells least, with other seeds."""
+
+
+def sweep_of(count: int) -> list[str]:
+    """The folders of so many jobs."""
+    return [f"sweep/{job}" for job in range(count)]
+
 
 SHEET = "python -m torchrl_pref.tasks {task} --animate --out {{folder}}/{task}.png -> {task}.gif"
 PENDULUM = "python examples/pendulum_file.py {folder}/pendulum.csv 2000 -> pendulum.csv"
@@ -190,7 +196,7 @@ PARTS: dict[str, Part] = {
             f"{HELDOUT} {SMALLER} {typed} tau=noisy hydra.run.dir={{folder}}/{name} -> {name}/{CSV}"
             for name, typed in BEYOND.items()
         ),
-        25,
+        50,
         docs_records.beyond,
     ),
     "into_package": benchmark("into_package", "docs/extending.md", 4),
@@ -200,16 +206,14 @@ PARTS: dict[str, Part] = {
         "docs/results.md",
         (
             "python benchmarks/main_job.py --folder {folder}/runs -> runs/query-optimal/tables.txt",
-            *(
-                f"python train.py setup=feed tau=noisy seed={seed} "
-                f"hydra.run.dir={{folder}}/runs/{run} -> runs/{run}/tables.txt"
-                for seed, run in MORE.items()
-            ),
+            "python train.py -m setup=feed tau=noisy evaluation.humans=20 "
+            f"seed={','.join(map(str, range(1, 1 + MORE)))} {TWO} "
+            f"hydra.sweep.dir={{folder}}/runs/sweep -> runs/sweep/{MORE - 1}/tables.txt",
             "python benchmarks/quality.py "
-            f"{' '.join(f'{{folder}}/runs/{run}' for run in (*CELLS, *MORE.values()))} "
+            f"{' '.join(f'{{folder}}/runs/{run}' for run in (*CELLS, *sweep_of(MORE)))} "
             "--json {folder}/quality.json -> quality.json",
         ),
-        20,
+        40,
         docs_tables.measured(),
     ),
     "select": benchmark("select", "docs/speed.md", 3),

@@ -237,7 +237,11 @@ BEYOND = {
     "2_features": "task=gaussian task.dimension=2 setup.budget=10",
     "8_features": "task=gaussian task.dimension=8 setup.budget=10",
     "24_features": "task=gaussian task.dimension=24 task.skew=3000 belief=laplace",
+    "four_options": "task=driver pool.options=4",
+    "ranking_of_three": "task=driver question=ranking",
     "weak": "task=driver question=weak",
+    "5_questions": "task=driver setup.budget=5",
+    "60_questions": "task=driver setup.budget=60",
     "tau_unknown": "task=driver belief=rationality",
 }
 """What else than choices between two options is tried, by name; its humans are noisy."""

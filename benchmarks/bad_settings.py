@@ -6,7 +6,7 @@ process forked from a warm one, in a folder of its own, under limits of time and
 legal after all: they are stopped where their work would start. A few of the refused are run again
 as processes of their own, which must say the same.
 
-    python benchmarks/bad_settings.py               all: 20 minutes of CPU; Ctrl-C ends it early
+    python benchmarks/bad_settings.py               all: half an hour of CPU; Ctrl-C ends it early
     python benchmarks/bad_settings.py --sample 200  a random sample
 """
 

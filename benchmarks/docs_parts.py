@@ -262,7 +262,11 @@ PARTS: dict[str, Part] = {
         docs_tables.measured(),
     ),
     "rationality": benchmark(
-        "rationality", "docs/beliefs.md", 15, "--seed 1 --plot {folder}/calibration.png"
+        "rationality",
+        "docs/beliefs.md",
+        8,
+        "--seed 1 --plot {folder}/calibration.png",
+        choose=docs_tables.inferred,
     ),
     "laplace": benchmark("laplace", "docs/beliefs.md", 2),
     "humans": benchmark("humans", "docs/humans.md", 15),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from fractions import Fraction
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -61,6 +62,19 @@ def ends(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
             kept["slope at the upper end"] = row["slope"]
             shown.append({**kept, **{key: row[key] for key in ("CPU s", "call MiB", "in all MiB")}})
     return shown
+
+
+def inferred(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """What ``rationality.py`` measured, with three decimals each, and some of the intervals."""
+    shown = [key for key in rows[0] if "%" not in key or key in ("50%", "80%", "90%", "95%")]
+    return [
+        {key: str(Fraction(row[key])) if key == "factor" else _decimals(row[key]) for key in shown}
+        for row in rows
+    ]
+
+
+def _decimals(value: Any) -> Any:
+    return f"{value:.3f}" if isinstance(value, float) else value
 
 
 def harmed(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:

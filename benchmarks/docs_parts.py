@@ -77,6 +77,15 @@ def on_task(task: str) -> Iterator[str]:
     yield f"{line} hydra.run.dir={{folder}}/{task}-heldout -> {task}-heldout/{CSV}"
 
 
+COSTS = {
+    "metrics": "docs/metrics.md",
+    "questions": "docs/questions.md",
+    "strategies": "docs/strategies.md",
+    "beliefs": "docs/beliefs.md",
+    "sessions": "docs/session.md",
+}
+"""Where it is said what single calls take, by what they are of."""
+
 METRICS = "[accuracy,log_likelihood,regret,rank_correlation,calibration]"
 
 
@@ -250,6 +259,7 @@ PARTS: dict[str, Part] = {
     ),
     "room_feed": benchmark("room_feed", "docs/strategies.md", 40, "--setup feed", "room"),
     "room_kinds": benchmark("room_kinds", "docs/strategies.md", 35, "--humans 60"),
+    **{f"{of}_cost": benchmark(f"{of}_cost", page, 0.5, of, "costs") for of, page in COSTS.items()},
     "large_pool": benchmark("large_pool", "docs/speed.md", 3),
     "aprel": Part(
         "docs/aprel.md",

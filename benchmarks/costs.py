@@ -1,0 +1,161 @@
+"""What single calls cost: metrics, kinds of question, strategies, beliefs, a live session.
+
+``python benchmarks/costs.py metrics`` (or another one) prints CPU milliseconds on one thread, on the
+Gridworld's pool of 1,000 questions (2,000 trajectories, D = 4) and with 100 samples a belief.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+sys.path[0] = str(Path(__file__).resolve().parents[1])  # this folder's select.py hides Python's
+
+import statistics
+import time
+from collections.abc import Iterator
+from functools import partial
+
+import torch
+from torch import Generator
+
+from benchmarks import common
+from torchrl_pref.acquisition.scoring import COMPILED, score_queries, together
+from torchrl_pref.beliefs.laplace import LaplaceBelief
+from torchrl_pref.beliefs.rationality import RationalityBelief
+from torchrl_pref.beliefs.sampled import Belief, uniform_sphere
+from torchrl_pref.envs.query import QueryEnv
+from torchrl_pref.errors import InputError
+from torchrl_pref.evaluation.metrics import METRICS, QUESTIONS, Exam, Standing, measure
+from torchrl_pref.humans.simulated import SimulatedHuman
+from torchrl_pref.questions import QUESTIONS as KINDS
+from torchrl_pref.questions.responses import Boltzmann
+from torchrl_pref.session import Session
+from torchrl_pref.strategies import STRATEGIES
+
+SAMPLES, PEOPLE, D = 100, 200, 4
+LATER = 10
+"""Answers after which strategies are looked at again."""
+
+
+def main() -> None:
+    """Print a table."""
+    parser = common.arguments(__doc__)
+    parser.add_argument("what", choices=list(TABLES), help="which table")
+    typed = common.start(parser)
+    title, rows = TABLES[typed.what]
+    common.report(f"CPU milliseconds: {title}", list(rows(typed.repeats)), typed.json)
+
+
+def of_metrics(repeats: int) -> Iterator[common.Row]:
+    """A row for each metric."""
+    pool, model = common.normalised_pool(), Boltzmann(common.TAU)
+    samples = common.belief_samples(PEOPLE, SAMPLES)
+    omega = uniform_sphere((PEOPLE, D), Generator().manual_seed(1))
+    queries = pool.features[:: len(pool) // QUESTIONS]
+    answers = model(torch.einsum("nkd,bd->bnk", queries, omega)).exp()
+    for name in METRICS:
+        exam = Exam(queries, queries, pool.features.flatten(0, 1), (name,))
+        ranks = exam.ranks(omega)  # told once, whatever is answered
+
+        def once(name: str = name, exam: Exam = exam, ranks: torch.Tensor | None = ranks) -> None:
+            measure([name], Standing(samples, omega, answers, exam, model, ranks))
+
+        yield {"metric": name, "ms": 1e3 * common.paired({name: once}, repeats)[name]}
+
+
+def of_questions(repeats: int) -> Iterator[common.Row]:
+    """A row for each kind of question, a column for each number of options."""
+    samples = common.belief_samples(1, SAMPLES)
+    for name, kind in KINDS.items():
+        row: common.Row = {"question": name}
+        for n_options in range(1, 7):
+            shape = (1, 1000, n_options, D)
+            queries = torch.randn(shape, generator=Generator().manual_seed(0))
+            model = Boltzmann(common.TAU, kind())
+            try:
+                model.n_answers(n_options)
+            except InputError:
+                row[f"K = {n_options}"] = ""
+                continue
+            score = partial(score_queries, samples, queries, model, together(*COMPILED))
+            row[f"K = {n_options}"] = 1e3 * common.paired({"": score}, repeats)[""]
+        yield row
+
+
+def of_strategies(repeats: int) -> Iterator[common.Row]:
+    """A row for each strategy: before the first answer, and later."""
+    model = Boltzmann(common.TAU)
+    belief, human = Belief(model, SAMPLES), SimulatedHuman(model)
+    env = QueryEnv(common.normalised_pool(), human, belief, batch_size=(1,), seed=0)
+    first = env.reset()
+    done = env.rollout(LATER, STRATEGIES["information_gain"](env), tensordict=first.clone())
+    later = env.step_mdp(done[:, -1])
+    for name, make in STRATEGIES.items():
+        strategy, row = make(env), {"strategy": name}
+        for what, session in (("before the first answer", first), (f"after {LATER}", later)):
+            choose = partial(_choose, strategy, session)
+            row[what] = 1e3 * common.paired({"": choose}, repeats)[""]
+        yield row
+
+
+def _choose(strategy: torch.nn.Module, session: torch.Tensor) -> None:
+    with torch.no_grad():
+        strategy(session.clone(False))
+
+
+def of_beliefs(repeats: int) -> Iterator[common.Row]:
+    """A row for each belief: an update of one person and of a thousand, after 12 answers."""
+    model, generator = Boltzmann(common.TAU), Generator().manual_seed(0)
+    beliefs = {
+        "sampled": Belief(model, SAMPLES),
+        "rationality": RationalityBelief(model, samples=SAMPLES),
+        "laplace": LaplaceBelief(model, SAMPLES),
+    }
+    for name, belief in beliefs.items():
+        row: common.Row = {"belief": name}
+        for people in (1, 1000):
+            omega = uniform_sphere((people, D), generator)
+            options = torch.randn(people, 12, 2, D, generator=generator)
+            likely = model((options @ omega[:, None, :, None]).squeeze(-1)).exp()
+            answers = likely.flatten(0, 1).multinomial(1, generator=generator).view(people, 12)
+            evidence = model.evidence(options, answers)
+            samples = belief.prior(people, D, generator)
+            ess = torch.full((people,), float(SAMPLES))
+            for h in range(1, 12):
+                samples, ess, _ = belief.update(samples, ess, evidence[:, :h], generator)
+            update = partial(belief.update, samples, ess, evidence, generator)
+            seconds = common.paired({"": update}, repeats)[""]
+            row[f"of {people:,} at once, each" if people > 1 else "of one person"] = (
+                1e3 * seconds / people
+            )
+        yield row
+
+
+def of_sessions(repeats: int) -> Iterator[common.Row]:
+    """A row for each strategy: an answer and the next question, of a live session of 20."""
+    features = torch.randn(1000, 2, 12, generator=Generator().manual_seed(0))
+    omega = uniform_sphere((12,), Generator().manual_seed(1))
+    for strategy in ("alignment_gain", "information_gain", "random"):
+        session = Session(features, Boltzmann(common.TAU), strategy, budget=21)
+        question, times = session.ask(), []
+        for _ in range(20):
+            answer = int((question.features @ omega).argmax())
+            start = time.process_time()
+            session.tell(answer)
+            question = session.ask()
+            times.append(1e3 * (time.process_time() - start))
+        mean = statistics.mean(times)
+        yield {"strategy": strategy, "mean": mean, "most": max(times)}
+
+
+TABLES = {
+    "metrics": (f"a metric of {PEOPLE} beliefs after an answer", of_metrics),
+    "questions": ("all scores of 1,000 candidates under one belief", of_questions),
+    "strategies": ("a choice among 1,000 questions for one person", of_strategies),
+    "beliefs": (f"an update after 12 answers, D = {D}", of_beliefs),
+    "sessions": ("an answer and the next of 20 questions, D = 12, 1,000 questions", of_sessions),
+}
+
+if __name__ == "__main__":
+    main()

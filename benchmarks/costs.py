@@ -1,7 +1,7 @@
 """What single calls cost: metrics, kinds of question, strategies, beliefs, a live session.
 
-``python benchmarks/costs.py metrics`` (or another one) prints CPU milliseconds on one thread, on the
-Gridworld's pool of 1,000 questions (2,000 trajectories, D = 4) and with 100 samples a belief.
+``python benchmarks/costs.py metrics`` (or another one) prints CPU milliseconds on one thread, on
+the Gridworld's pool of 1,000 questions (2,000 trajectories, D = 4), with 100 samples a belief.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import statistics
 import time
 from collections.abc import Iterator
 from functools import partial
+from itertools import product
 
 import torch
 from torch import Generator
@@ -136,17 +137,22 @@ def of_sessions(repeats: int) -> Iterator[common.Row]:
     """A row for each strategy: an answer and the next question, of a live session of 20."""
     features = torch.randn(1000, 2, 12, generator=Generator().manual_seed(0))
     omega = uniform_sphere((12,), Generator().manual_seed(1))
-    for strategy in ("alignment_gain", "information_gain", "random"):
-        session = Session(features, Boltzmann(common.TAU), strategy, budget=21)
-        question, times = session.ask(), []
-        for _ in range(20):
-            answer = int((question.features @ omega).argmax())
-            start = time.process_time()
-            session.tell(answer)
+    model = Boltzmann(common.TAU)
+    beliefs = {"tau known": Belief(model), "tau unknown": RationalityBelief(model)}
+    for strategy, (what, belief) in product(("alignment_gain", "random"), beliefs.items()):
+        times: list[float] = []
+        for _ in range(1 + repeats // 3):  # the first one warms up
+            session = Session(features, model, strategy, belief, budget=21)
             question = session.ask()
-            times.append(1e3 * (time.process_time() - start))
-        mean = statistics.mean(times)
-        yield {"strategy": strategy, "mean": mean, "most": max(times)}
+            for _ in range(20):
+                answer = int((question.features @ omega).argmax())
+                start = time.process_time()
+                session.tell(answer)
+                question = session.ask()
+                times.append(1e3 * (time.process_time() - start))
+        counted = times[20:]
+        row: common.Row = {"strategy": strategy, "belief": what}
+        yield {**row, "mean": statistics.mean(counted), "most": max(counted)}
 
 
 TABLES = {

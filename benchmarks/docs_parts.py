@@ -279,7 +279,7 @@ PARTS: dict[str, Part] = {
         choose=docs_tables.inferred,
     ),
     "laplace": benchmark("laplace", "docs/beliefs.md", 2),
-    "humans": benchmark("humans", "docs/humans.md", 15),
+    "humans": benchmark("humans", "docs/humans.md", 8),
     "metrics": Part("docs/metrics.md", tuple(on_beliefs()), 5, docs_records.metrics),
     "strategies": Part(
         "docs/strategies.md",

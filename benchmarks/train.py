@@ -109,7 +109,8 @@ def make_env(n_envs: int) -> FeedEnv:
     """Our environment, B sessions."""
     model = Boltzmann(common.TAU)
     pool, human = common.normalised_pool(), SimulatedHuman(model)
-    return FeedEnv(pool, human, Belief(model), BUDGET, 2 * BUDGET, batch_size=(n_envs,))
+    paper: dict[str, Any] = {"skip": "regret", "objective": "information_gain"}
+    return FeedEnv(pool, human, Belief(model), BUDGET, 2 * BUDGET, batch_size=(n_envs,), **paper)
 
 
 @cache

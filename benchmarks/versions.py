@@ -12,6 +12,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
+PAPER: dict[str, Any] = {"objective": "information_gain"}
+"""What environments of version 0.1.0 were rewarded for by default."""
+
 MEASURE = "--measure"
 """First argument of a process that measures the version in its working directory."""
 
@@ -135,7 +138,7 @@ def measure() -> dict[str, float]:
     def greedily(model: ResponseModel, sessions: int, seed: int) -> float:
         """CPU seconds of a step of one session, by the greedy strategy."""
         human, belief = SimulatedHuman(model), Belief(model)
-        env = QueryEnv(pool, human, belief, batch_size=(sessions,), seed=seed)
+        env = QueryEnv(pool, human, belief, batch_size=(sessions,), seed=seed, **PAPER)
         start = time.process_time()
         with torch.no_grad():
             taken = env.rollout(20, Greedy(model))
@@ -144,7 +147,8 @@ def measure() -> dict[str, float]:
     def steps(kind: type[QueryEnv] | type[FeedEnv], action: int, seed: int) -> float:
         """CPU seconds of a step of one session that takes the same action again and again."""
         model, seconds = Boltzmann(4.5), 0.0
-        env = kind(pool, SimulatedHuman(model), Belief(model), batch_size=(1,), seed=seed)
+        usual = PAPER if kind is QueryEnv else {**PAPER, "skip": "regret"}
+        env = kind(pool, SimulatedHuman(model), Belief(model), batch_size=(1,), seed=seed, **usual)
         session = env.reset()
         for _ in range(20):
             session["action"] = torch.tensor([action])

@@ -36,7 +36,8 @@ def make(
     **options: object,
 ) -> QueryEnv | FeedEnv:
     belief = Belief(model, samples=20, moves=2)
-    options = {"budget": 5, "batch_size": (batch,), "seed": 0, **options}
+    paper = {"objective": "information_gain", **({"skip": "regret"} if kind is FeedEnv else {})}
+    options = {"budget": 5, "batch_size": (batch,), "seed": 0, **paper, **options}
     return kind(pool, SimulatedHuman(model), belief, **options)  # type: ignore[arg-type]
 
 

@@ -36,8 +36,9 @@ def env_of(
     human: type[HumanBase] = SimulatedHuman,
     **options: object,
 ) -> QueryEnv:
-    options = {"budget": 6, "batch_size": (4,), "seed": 0, **options}
-    return QueryEnv(pool, human(model), Belief(model, 20, 2), batch=batch, **options)  # type: ignore[arg-type,call-arg]
+    usual = {"budget": 6, "batch_size": (4,), "seed": 0, "objective": "information_gain"}
+    options = {"batch": batch, **usual, **options}
+    return QueryEnv(pool, human(model), Belief(model, 20, 2), **options)  # type: ignore[arg-type]
 
 
 def asked(env: QueryEnv, session: TensorDictBase, action: Tensor) -> TensorDictBase:

@@ -322,7 +322,7 @@ def spoiled(pool: QueryPool, key: Any, change: Callable[[torch.Tensor], torch.Te
         ((*HISTORY, "options"), lambda x: x / 0.0, "history.options: NaN"),
         (("session", "n_asked"), lambda x: x + 9, "n_asked from 12 to 12: expected 0 to 5"),
         (("session", "n_asked"), lambda x: x - 1, "n_asked contradict each other"),
-        (("session", "n_offered"), lambda x: x - 9, "n_offered from -6 to -6: expected 0 to 10"),
+        (("session", "n_offered"), lambda x: x - 9, "n_offered from -6 to -6: expected 0 to 25"),
         ("offers", lambda x: x - 60, "offers from"),
         (("session", "ess"), lambda x: x * math.nan, "session.ess: NaN"),
     ],

@@ -56,6 +56,6 @@ def test_unknown_policies_are_refused() -> None:
         pretrained_checkpoint("query", "noisy", 99)
     model = Boltzmann(3.0)
     pool = QueryPool(torch.rand(9, 2, 4))
-    feed = FeedEnv(pool, SimulatedHuman(model), Belief(model), batch_size=(2,))
+    feed = FeedEnv(pool, SimulatedHuman(model), Belief(model), skip="regret", batch_size=(2,))
     with pytest.raises(InputError, match="skip='regret'"):
         pretrained_policy(feed, "noisy")

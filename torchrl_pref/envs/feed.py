@@ -35,8 +35,8 @@ class FeedEnv(SessionEnv):
         offers: O, at least H. None is the paper's 2H with ``regret`` and 5H with ``free``.
         on_skip: ``new`` offers another query after a skip; ``repeat`` is the paper's literal
             s' = s and offers the same one again.
-        skip: ``regret`` or ``free``.
-        objective: a name of ``objectives.OBJECTIVES``; the default is the paper's.
+        skip: ``free``, or ``regret`` as in the paper.
+        objective: a name of ``objectives.OBJECTIVES``; the paper's is ``information_gain``.
         batch_size: (B,), sessions that run side by side.
         seed: seeds the environment's own generator; the global generators are never used. None: no
             two environments, in whatever process, face the same humans.
@@ -56,8 +56,8 @@ class FeedEnv(SessionEnv):
         budget: int = 20,
         offers: int | None = None,
         on_skip: str = "new",
-        skip: str = "regret",
-        objective: str = "information_gain",
+        skip: str = "free",
+        objective: str = "alignment",
         batch_size: tuple[int, ...] = (64,),
         seed: int | None = None,
         device: torch.device | str = "cpu",

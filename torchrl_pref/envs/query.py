@@ -41,7 +41,7 @@ class QueryEnv(SessionEnv):
             a fresh random subset for each session, so that a policy learns to choose and not to
             remember. None puts the whole pool on the table, in order.
         repeats: whether a query may be asked again.
-        objective: a name of ``objectives.OBJECTIVES``; the default is the paper's.
+        objective: a name of ``objectives.OBJECTIVES``; the paper's is ``information_gain``.
         batch_size: (B,), sessions that run side by side.
         seed: seeds the environment's own generator; the global generators are never used. None: no
             two environments, in whatever process, face the same humans.
@@ -63,7 +63,7 @@ class QueryEnv(SessionEnv):
         budget: int = 20,
         candidates: int | None = None,
         repeats: bool = True,
-        objective: str = "information_gain",
+        objective: str = "alignment",
         batch_size: tuple[int, ...] = (64,),
         seed: int | None = None,
         device: torch.device | str = "cpu",

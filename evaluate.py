@@ -185,7 +185,7 @@ def evaluate_taus(
 ) -> Records:
     """The baselines and what was learned for each tau, a task each."""
     from torchrl_pref import build
-    from torchrl_pref.evaluation import comparison
+    from torchrl_pref.evaluation import comparison, misjudged
     from torchrl_pref.evaluation.records import Records
 
     pools = build.make_pools(settings)
@@ -195,8 +195,7 @@ def evaluate_taus(
     for task, _ in tasks:
         comparison.try_strategies(own, settings, task)
     for task, learned in tasks:
-        for found in comparison.evaluate_misjudged(settings, task, learned, own=own):
-            records.add(found)
+        records.entries += misjudged.evaluate_misjudged(settings, task, learned, own=own).entries
     return records
 
 
@@ -305,7 +304,7 @@ def evaluate_checkpoints(settings: Settings, paths: list[Path]) -> tuple[Records
     behind them."""
     from torchrl_pref import build
     from torchrl_pref.checkpoints.checkpoint import Checkpoint
-    from torchrl_pref.evaluation import comparison
+    from torchrl_pref.evaluation import comparison, misjudged
     from torchrl_pref.evaluation.records import Records
     from torchrl_pref.training.figure import Training
     from torchrl_pref.training.progress import Progress
@@ -332,8 +331,8 @@ def evaluate_checkpoints(settings: Settings, paths: list[Path]) -> tuple[Records
         comparison.try_strategies(own, its_settings, task)
     records, trained = Records(), []
     for (its_settings, task, learned), test in zip(groups, tests, strict=True):
-        for found in comparison.evaluate_misjudged(its_settings, task, learned, test, own):
-            records.add(found)
+        found = misjudged.evaluate_misjudged(its_settings, task, learned, test, own)
+        records.entries += found.entries
         for key, checkpoint in learned.items():
             trained.append(Training(key, task.title, Progress.of(checkpoint.training)))
     return records, trained

@@ -178,8 +178,9 @@ def start(folder: Path, settings: Settings) -> float:
         checkpoint.check_fits(task.train, own_indices=True)
         build.load_weights(trainer.policy, checkpoint)
         trainer.start_average()
+    # Before this is there, there is nothing to go on with.
+    write_text(folder / CONFIG, OmegaConf.to_yaml(OmegaConf.create({**settings})))
     with app.resumable(folder):
-        write_text(folder / CONFIG, OmegaConf.to_yaml(OmegaConf.create({**settings})))
         for pool, name in zip(pools, POOLS, strict=True):
             pool.save(folder / name)
         del settings["checkpoint"]  # no more than where the weights began

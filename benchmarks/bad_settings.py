@@ -418,7 +418,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the sample (default 0)")
     parser.add_argument("--apart", type=int, default=20, help="run again as processes (default 20)")
     parser.add_argument("--show", default="", help="print every command with this outcome")
-    typed = parser.parse_args()
+    typed = common.start(parser)
     commands, luck = every_command(), random.Random(typed.seed)
     if typed.sample is not None:
         commands = luck.sample(commands, typed.sample)

@@ -18,6 +18,7 @@ from functools import partial
 from itertools import product
 
 import torch
+from tensordict import TensorDictBase
 from torch import Generator
 
 from benchmarks import common
@@ -100,7 +101,7 @@ def of_strategies(repeats: int) -> Iterator[common.Row]:
         yield row
 
 
-def _choose(strategy: torch.nn.Module, session: torch.Tensor) -> None:
+def _choose(strategy: torch.nn.Module, session: TensorDictBase) -> None:
     with torch.no_grad():
         strategy(session.clone(False))
 
@@ -141,7 +142,7 @@ def of_sessions(repeats: int) -> Iterator[common.Row]:
     beliefs = {"tau known": Belief(model), "tau unknown": RationalityBelief(model)}
     for strategy, (what, belief) in product(("alignment_gain", "random"), beliefs.items()):
         times: list[float] = []
-        for _ in range(1 + repeats // 3):  # the first one warms up
+        for _ in range(1 + max(1, repeats // 3)):  # the first one warms up
             session = Session(features, model, strategy, belief, budget=21)
             question = session.ask()
             for _ in range(20):

@@ -101,11 +101,17 @@ def main() -> None:
     total = sum(PARTS[name].minutes for name in names)
     form = "{desc}{percentage:3.0f}% |{bar}| {elapsed}"
     with tqdm(total=total, bar_format=form) as bar:
+        failed = []
         for name in names:
             bar.set_description(name)
-            make(name, typed.folder.absolute())
+            try:
+                make(name, typed.folder.absolute())
+            except subprocess.CalledProcessError:  # it has said why
+                failed.append(name)
             bar.update(PARTS[name].minutes)
     print("written; look at the figures, and at git diff docs README.md")
+    if failed:
+        sys.exit(f"{', '.join(failed)}: not made, as a command failed; above it says why")
 
 
 if __name__ == "__main__":

@@ -322,7 +322,7 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--starts", type=int, default=20, help="double starts")
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
-    typed = parser.parse_args()
+    typed = common.start(parser)
     scratch = Path(tempfile.mkdtemp(prefix="kills-"))
     begun = time.perf_counter()
     try:

@@ -56,6 +56,9 @@ from torchrl_pref.tasks.gaussian import GaussianTask
 FIRST_SEED = 900_000
 """Of the pools, far from those of any training or test."""
 
+OF_HUMANS = 950_000
+"""Of who is asked, and of all luck: no pool is drawn from the same numbers."""
+
 BASELINE, FINE, PART = "alignment", "400 samples", "100 of 400"
 TRIED = {
     "query": ("2 ahead", "3 ahead", "mixed", "information", FINE, PART),
@@ -250,7 +253,7 @@ def measure(corner: Corner, setup: str, pools: int, humans: int, policies: Tried
         pool = normalised(corner, number)
         model = model_for(corner, pool)
         human = SimulatedHuman(model, 4.0 if corner.unknown else 1.0)
-        common = {"budget": corner.budget, "batch_size": (humans,), "seed": FIRST_SEED + number}
+        common = {"budget": corner.budget, "batch_size": (humans,), "seed": OF_HUMANS + number}
         for name, make_strategy in tried.items():
             samples = 400 if name in (FINE, PART) else 100
             belief = (RationalityBelief if corner.unknown else Belief)(model, samples=samples)

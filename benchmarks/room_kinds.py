@@ -4,9 +4,8 @@ In each corner the same humans have so many seconds, and each question takes as 
 does (``answers.py`` has the model). At every step any query of the pool may be asked about as a
 question of any of four kinds. *Gain a second* is greedy: the query and the kind with the highest
 expected gain in alignment for each second. Beside it stand the same by information, greedy by the
-gain alone, each kind alone, what looks two questions ahead (the highest rate that a question and
-the best one after it have together, over the answers), and gain a second by four times as many
-samples.
+gain alone, each kind alone, what looks two questions ahead (what a question and the one after it
+gain together for each second), and gain a second by four times as many samples.
 
 Columns are how much more each is than *gain a second*, in the mean alignment over all seconds.
 *Room* is that of the one that is best on every other pool, on the remaining pools; ± is twice the
@@ -23,6 +22,7 @@ from pathlib import Path
 
 sys.path[0] = str(Path(__file__).resolve().parents[1])  # this folder's select.py hides Python's
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -117,7 +117,7 @@ def only(label: str) -> Rule:
     def values(asking: Asking, samples: Tensor, left: Tensor) -> Tensor:
         found = by(alignment_gain, True)(asking, samples, left)
         others = [place for place, kind in enumerate(asking.kinds) if kind.label != label]
-        return found.index_fill(1, torch.tensor(others), -1.0)
+        return found.index_fill(1, torch.tensor(others), -math.inf)
 
     return values
 
@@ -126,16 +126,14 @@ def two_ahead(asking: Asking, samples: Tensor, left: Tensor) -> Tensor:
     """The rate of a question and the best after it together, of the best by gain a second."""
     greedy = by(alignment_gain, True)(asking, samples, left)
     seconds = greedy.new_tensor([kind.seconds for kind in asking.kinds])
-    late = left[:, None] < seconds + seconds.min()  # then no second question has the time
-    values = torch.full_like(greedy, -1.0)
+    values = torch.full_like(greedy, -math.inf)
     for s, belief in enumerate(samples):
         looks = _looks(asking, belief, greedy[s])
-        allowed = greedy[s].masked_fill((seconds > left[s])[:, None], -1.0).flatten()
-        for index in allowed.topk(FIRST).indices.tolist():
+        allowed = greedy[s].masked_fill((seconds > left[s])[:, None], -math.inf)
+        for index in allowed.flatten().topk(FIRST).indices.tolist():
             place, query = divmod(index, greedy.shape[-1])
-            values[s, place, query] = greedy[s, place, query]
-            if not late[s, place]:
-                values[s, place, query] = _rate(asking, looks, belief, place, query, left[s])
+            rate = _rate(asking, looks, belief, place, query, left[s], allowed.max())
+            values[s, place, query] = rate
     return values
 
 
@@ -151,21 +149,40 @@ def _looks(asking: Asking, belief: Tensor, greedy: Tensor) -> list[Ahead]:
 
 
 def _rate(
-    asking: Asking, looks: list[Ahead], belief: Tensor, place: int, query: int, left: Tensor
+    asking: Asking,
+    looks: list[Ahead],
+    belief: Tensor,
+    place: int,
+    query: int,
+    left: Tensor,
+    usual: Tensor,
 ) -> float:
-    """Expected gain of a question and of the best after each of its answers, for each second."""
+    """Expected gain of a question and of the one after it, over the seconds that both take.
+
+    After each answer the next question is the one that gains most beyond what its seconds are
+    usually worth: so the quotient of both means is greatest (Dinkelbach, 1967), but for one step.
+    Where there is no time for another question the first one counts alone.
+    """
     kind = asking.kinds[place]
     shown = asking.features[None, query, : kind.options].unsqueeze(0)
     joint = predict_answers(belief.unsqueeze(0), shown, kind.model).probs[0, 0].mT / len(belief)
     share = joint.sum(-1)  # (R)
     weights = joint / share.clamp(min=1e-30).unsqueeze(-1)
-    centred = belief - belief.mean(0)  # Ahead's values are about that mean, too
-    gained = (weights @ centred).square().sum(-1)
-    rates = [gained / kind.seconds]  # where it is the last one
+    # Squared lengths are about the mean of the belief, as those of ``Ahead`` are.
+    reached = (weights @ (belief - belief.mean(0))).square().sum(-1)
+    best, gain, time = (torch.zeros_like(share) - math.inf for _ in range(3))
     for then, look in zip(asking.kinds, looks, strict=True):
         if kind.seconds + then.seconds <= left:
-            rates.append(look.values(weights, 1, 1).amax(-1) / (kind.seconds + then.seconds))
-    return float((share * torch.stack(rates).amax(0)).sum())
+            more = look.values(weights, 1, 1).amax(-1) - reached
+            beyond = more - usual * then.seconds
+            better = beyond > best
+            best = torch.where(better, beyond, best)
+            gain = torch.where(better, more, gain)
+            time = torch.where(better, then.seconds, time)
+    first = (share * reached).sum()
+    if best.isinf().any():
+        return float(first / kind.seconds)
+    return float((first + (share * gain).sum()) / (kind.seconds + (share * time).sum()))
 
 
 RULES: dict[str, Rule] = {
@@ -178,9 +195,11 @@ RULES: dict[str, Rule] = {
 }
 
 
-def asked(asking: Asking, rule: Rule, samples: int, limit: float, omega: Tensor) -> Tensor:
+def asked(
+    asking: Asking, rule: Rule, samples: int, limit: float, omega: Tensor, seed: int
+) -> Tensor:
     """Mean alignment over the seconds (S) of humans who are asked by a rule."""
-    generator, fate = Generator().manual_seed(0), Generator().manual_seed(1)
+    generator, fate = (Generator().manual_seed(seed + part) for part in range(2))
     belief = Belief(asking.kinds[0].model, samples)
     n_humans = len(omega)
     held = belief.prior(n_humans, omega.shape[-1], generator)
@@ -191,9 +210,12 @@ def asked(asking: Asking, rule: Rule, samples: int, limit: float, omega: Tensor)
     asks = torch.arange(n_humans)
     while len(asks := asks[left[asks] >= seconds.min()]):
         values = rule(asking, held[asks], left[asks])
-        values = values.masked_fill((seconds > left[asks, None]).unsqueeze(-1), -2.0)
-        best, n_queries = values.flatten(1).argmax(1), values.shape[-1]
-        place, query = best // n_queries, best % n_queries
+        values = values.masked_fill((seconds > left[asks, None]).unsqueeze(-1), -math.inf)
+        value, best = values.flatten(1).max(1)
+        asks, best = asks[~value.isinf()], best[~value.isinf()]  # the others have no time left
+        if not len(asks):
+            break
+        place, query = best // values.shape[-1], best % values.shape[-1]
         luck = torch.rand(n_humans, generator=fate)[asks]
         newest = _answered(asking, omega[asks], place, query, luck)
         area[asks] += seconds[place] * (held[asks] @ omega[asks, :, None]).mean((1, 2))
@@ -265,6 +287,8 @@ def main() -> None:
     parser.add_argument("--humans", type=int, default=100, help="of each pool (default 100)")
     parser.add_argument("--only", help="corners, by semicolons")
     typed = common.start(parser)
+    if typed.pools < 2:
+        parser.error("--pools: expected at least 2, to choose on some and to judge on others")
     names = typed.only.split(";") if typed.only else list(CORNERS)
     if unknown := [name for name in names if name not in CORNERS]:
         parser.error(f"--only {unknown[0]}: expected some of {'; '.join(CORNERS)}")
@@ -273,10 +297,12 @@ def main() -> None:
         corner, found = replace(Corner(), **CORNERS[name]), room.Found(baseline=BASELINE)
         for number in tqdm(range(typed.pools), desc="pools", leave=False):
             asking = asking_in(corner, number)
-            luck = Generator().manual_seed(room.FIRST_SEED + number)
-            omega = uniform_sphere((typed.humans, corner.dimension), luck)
+            seed = room.OF_HUMANS + 3 * number  # of who is asked, the belief's luck, and theirs
+            humans = Generator().manual_seed(seed)
+            omega = uniform_sphere((typed.humans, corner.dimension), humans)
             for each, rule in RULES.items():
-                mean = asked(asking, rule, 400 if each == FINE else 100, corner.limit, omega)
+                count = 400 if each == FINE else 100
+                mean = asked(asking, rule, count, corner.limit, omega, seed + 1)
                 found.curves.setdefault(each, []).append(mean.unsqueeze(1))
         rows.append(room.row_of(name, found, [AHEAD, *(each for each in RULES if each != AHEAD)]))
     title = f"Mean alignment over all seconds: {BASELINE}, and what others are more"

@@ -43,7 +43,7 @@ def main() -> None:
         if archive.returncode != 0:
             parser.error(f"{options.earlier}: {archive.stderr.decode().strip()}")
         subprocess.run(["tar", "-x", "-C", scratch], input=archive.stdout, check=True)
-        least = measured({"earlier": Path(scratch), "now": now}, options.repeats // 3)
+        least = measured({"earlier": Path(scratch), "now": now}, max(1, options.repeats // 3))
     rows: list[common.Row] = [
         {
             "CPU ms": name,

@@ -83,17 +83,11 @@ class Problem:
             who = f"{who}, {human.kind}"
         if type(self.question) is not Choice:
             who = f"{who}, {named(self.question)}"
-        if not self.misjudges:
+        if not self.mistakes:
             return who
         assumed = "optimal" if self.tau is None else f"tau={self.tau:.4g}"
         beside = f", lapse={self.belief_lapse:g}" if self.belief_lapse else ""
         return f"{who}; assumed {assumed}{beside}"
-
-    @property
-    def misjudges(self) -> bool:
-        """Whether the belief takes the human for another than they are."""
-        human = self._human
-        return bool(human.kind) or (human.tau, human.lapse) != (self.tau, self.belief_lapse)
 
     @property
     def response_model(self) -> ResponseModel:
@@ -106,13 +100,23 @@ class Problem:
         return model_of(self._human.tau, self.question, self._human.lapse)
 
     def judging_rightly(self) -> Problem:
-        """The same where the belief is right: it is told the tau and the lapses of the human. Of a
-        human who differs in more, or whose tau it infers or cannot be told, it meets the one whom
-        it expects."""
+        """The same where the belief is told the tau and the lapses of the human, who has nothing
+        else that is particular."""
         human = self._human
-        if human.kind or self.infers or human.tau is None:
-            return replace(self, human=Human(self.tau, self.belief_lapse))
-        return replace(self, tau=human.tau, belief_lapse=human.lapse)
+        own = Human(human.tau, human.lapse)
+        return replace(self, tau=human.tau, belief_lapse=human.lapse, human=own)
+
+    @property
+    def mistakes(self) -> list[str]:
+        """In what the belief takes the human for another, in words."""
+        human, found = self._human, []
+        if human.kind:
+            found.append(human.kind)
+        if human.tau != self.tau:
+            found.append("optimal" if self.tau is None else f"tau={self.tau:.4g}")
+        if human.lapse != self.belief_lapse:
+            found.append(f"lapse={self.belief_lapse:g}")
+        return found
 
     @property
     def _human(self) -> Human:

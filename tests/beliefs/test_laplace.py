@@ -125,7 +125,7 @@ def test_it_is_near_to_the_samples(n_features: int, generator: Generator) -> Non
 def test_calibration(
     model: Boltzmann, n_features: int, n_options: int, least: float, generator: Generator
 ) -> None:
-    """Ranks of ω are even, up to what docs/beliefs.md says: a Gaussian is a little too sure."""
+    """Ranks of ω are even, but for a Gaussian that is a little too sure, most so with lapses."""
     sessions, n_answers = 300, 20
     belief = LaplaceBelief(model, samples=99)
     omega = uniform_sphere((sessions, n_features), generator)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from PIL import ExifTags, Image, ImageChops, ImageDraw
+from PIL import ExifTags, Image, ImageChops, ImageDraw, ImageOps
 from recordings import DATASET, write_csv, write_minari
 
 from torchrl_pref.errors import InputError
@@ -130,19 +130,35 @@ def test_images_keep_their_shape(size: tuple[int, int], tmp_path: Path) -> None:
         assert drawn.axes.bbox.padded(1e-6).get_points().tolist()[0] <= box.get_points().tolist()[0]
 
 
-def test_photographs_stand_upright(tmp_path: Path) -> None:
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_photographs_stand_upright(orientation: int, tmp_path: Path) -> None:
     """A camera that was turned says so in the file (EXIF), and a browser turns the image back."""
-    turned = Image.new("RGB", (320, 80), "white")
-    turned.paste("blue", (0, 0, 160, 80))
+    photograph = Image.new("RGB", (320, 80), "white")
+    photograph.paste("blue", (0, 0, 160, 40))
     tags = Image.Exif()
-    tags[ExifTags.Base.Orientation] = 6  # its left is up
-    turned.save(tmp_path / "a.jpg", exif=tags)
+    tags[ExifTags.Base.Orientation] = orientation
+    photograph.save(tmp_path / "a.jpg", exif=tags, quality=95)
+    expected = ImageOps.exif_transpose(Image.open(tmp_path / "a.jpg")).convert("RGB")
     picture = Picture(str(tmp_path / "a.jpg"))
-    assert Images().aspect(picture) == 320 / 80
+    assert Images().aspect(picture) == expected.height / expected.width
     seen = Images().at(picture, 0).convert("RGB")
-    assert seen.size == (80, 320)
-    blue, white = (seen.getpixel((40, y)) for y in (20, 300))
-    assert blue[0] < 40 < 215 < white[0]
+    assert seen.size == expected.size
+    assert not ImageChops.difference(seen, expected).getbbox()
+
+
+def test_tags_of_a_photograph_may_be_damaged(tmp_path: Path) -> None:
+    tags = Image.Exif()
+    tags[ExifTags.Base.Orientation] = 6
+    Image.new("RGB", (40, 10), "blue").save(tmp_path / "a.jpg", exif=tags)
+    data = (tmp_path / "a.jpg").read_bytes()
+    start = data.index(b"Exif") + 6
+    end = start + 26  # a header of 8 bytes, and one tag
+    picture = Picture(str(tmp_path / "b.jpg"))
+    for place in range(start, end):
+        for value in (0, 1, 7, 127, 255):
+            (tmp_path / "b.jpg").write_bytes(data[:place] + bytes([value]) + data[place + 1 :])
+            assert Images().aspect(picture) in (4.0, 0.25)
+            assert sorted(Images().at(picture, 0).size) == [10, 40]
 
 
 def test_the_shape_of_a_panel_is_that_of_its_images(tmp_path: Path) -> None:

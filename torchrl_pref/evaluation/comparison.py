@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import torch
@@ -15,13 +14,13 @@ from torchrl_pref.acquisition.functions import alignment_gain
 from torchrl_pref.build import load_policy, make_feed_env, make_query_env
 from torchrl_pref.checkpoints.checkpoint import Checkpoint
 from torchrl_pref.config.memory import check_memory
-from torchrl_pref.config.sections import GroupSection, Settings
+from torchrl_pref.config.sections import Settings
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.errors import InputError, check_count, check_flag, check_seed
 from torchrl_pref.evaluation.metrics import make_exam
 from torchrl_pref.evaluation.own import Maker, make_own, try_own
-from torchrl_pref.evaluation.records import COMPARISON, MISJUDGED, REFERENCE, Records, entry_of
+from torchrl_pref.evaluation.records import COMPARISON, Records, entry_of
 from torchrl_pref.evaluation.run import CURVES, Evaluation, draw_humans, evaluate
 from torchrl_pref.evaluation.side_by_side import Entrant
 from torchrl_pref.policies.base import Policy
@@ -48,6 +47,7 @@ def evaluate_task(
     test: QueryPool | None = None,
     own: Mapping[str, Maker] | None = None,
     protocol: str = COMPARISON,
+    title: str | None = None,
 ) -> Records:
     """Compare strategies on the held-out pool.
 
@@ -61,7 +61,7 @@ def evaluate_task(
         learned: checkpoints to evaluate, by key.
         test: another held-out pool, normalised; by default the task's.
         own: what makes the strategies of the user.
-        protocol: of the records.
+        protocol, title: of the records; by default the task's title.
     """
     pools = {HELD_OUT: task.test if test is None else test}
     evaluated = {key: value for key, value in settings.items() if key != "training"}
@@ -70,39 +70,15 @@ def evaluate_task(
         pools[TRAINING] = task.train
     records = Records()
     for name, pool in pools.items():
-        title = f"{task.title}, rightly assumed" if protocol == REFERENCE else task.title
-        title = title if len(pools) == 1 else f"{title}, {name} pool"
+        named = task.title if title is None else title
+        named = named if len(pools) == 1 else f"{named}, {name} pool"
         for key, result in compare(settings, task, pool, learned, own).items():
             seed = learned[key].settings["seed"] if key in learned else 0
-            identity = {"protocol": protocol, "task": title, "pool": name}
+            identity = {"protocol": protocol, "task": named, "pool": name}
             identity["strategy"] = key
             entry = entry_of(result, CURVES, "seconds_per_query", **identity, seed=seed)
             records.entries.append(entry)
     return records
-
-
-def evaluate_misjudged(
-    settings: Settings,
-    task: Problem,
-    learned: Mapping[str, Checkpoint],
-    test: QueryPool | None = None,
-    own: Mapping[str, Maker] | None = None,
-) -> Iterator[Records]:
-    """:func:`evaluate_task`, and where the belief takes the human for another, once more where it
-    does not: that tells what it costs."""
-    if not task.misjudges:
-        yield evaluate_task(settings, task, learned, test, own)
-        return
-    yield evaluate_task(settings, task, learned, test, own, MISJUDGED)
-    right = task.judging_rightly()
-    if right.human != task.human:
-        section = cast(GroupSection, {"name": "simulated", "spread": 1, "tau": None, "lapse": 0.0})
-        settings = {**settings, "human": section}
-        learned = {
-            key: replace(one, settings={**one.settings, "human": section})
-            for key, one in learned.items()
-        }
-    yield evaluate_task(settings, right, learned, test, own, REFERENCE)
 
 
 def check_evaluation(settings: Settings) -> tuple[int, int]:

@@ -100,21 +100,17 @@ class Records:
         return list(dict.fromkeys(entry.task for entry in self.entries))
 
     def reference_of(self, task: str) -> str | None:
-        """The task on the same pool in which the belief is right about the human: the next such
-        one, or else the last; None where it is right anyhow."""
+        """The task on the same pool in which the belief is right about the human, the next such
+        one; None where none follows that is for this task."""
         own = self.of_task(task).entries[0]
         if own.protocol != MISJUDGED:
             return None
-        alike = [e for e in self.entries if e.protocol == REFERENCE and e.pool == own.pool]
-        found = list(dict.fromkeys(entry.task for entry in alike))
-        tasks = self.tasks
-        later = (other for other in found if tasks.index(other) > tasks.index(task))
-        return next(later, found[-1] if found else None)
-
-    def add(self, others: Records) -> None:
-        """Take in the tasks that are not there yet."""
-        there = set(self.tasks)
-        self.entries += [entry for entry in others.entries if entry.task not in there]
+        place = self.tasks.index(task)
+        for other in self.tasks[place + 1 :]:
+            entry = self.of_task(other).entries[0]
+            if entry.protocol == REFERENCE and entry.pool == own.pool:
+                return other
+        return None
 
     @property
     def strategies(self) -> list[str]:

@@ -7,13 +7,15 @@ its shape. An animated GIF moves with the frames of its scene, or makes them whe
 from __future__ import annotations
 
 import io
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
-from PIL import Image, ImageOps
+from PIL import ExifTags, Image
 
 from torchrl_pref.errors import InputError
 from torchrl_pref.tasks.scene import Picture, Scene, Shape
@@ -41,7 +43,8 @@ class Images:
             InputError: see :meth:`count`.
         """
         with self._opened(picture) as image:
-            return image.height / image.width
+            across, up = image.size
+            return across / up if _turned(image) in LYING else up / across
 
     def at(self, picture: Picture, moment: int) -> Image.Image:
         """A frame of an image, the last one where it has fewer.
@@ -51,7 +54,8 @@ class Images:
         """
         with self._opened(picture) as image:
             image.seek(min(moment, _count(image) - 1))
-            return image.convert("RGBA")
+            shown, turn = image.convert("RGBA"), TURNS.get(_turned(image))
+            return shown if turn is None else shown.transpose(turn)
 
     @contextmanager
     def _opened(self, picture: Picture) -> Iterator[Image.Image]:
@@ -60,8 +64,8 @@ class Images:
             image = self._animated.get(path)
             if image is None:
                 file = io.BytesIO(Path(path).read_bytes())
-                image = Image.open(file, formats=("PNG", "JPEG", "GIF"))
-                ImageOps.exif_transpose(image, in_place=True)  # upright, as a browser shows it
+                with warnings.catch_warnings(action="ignore", category=UserWarning):
+                    image = Image.open(file, formats=("PNG", "JPEG", "GIF"))
                 if _count(image) > 1:
                     self._animated[path] = image
             yield image
@@ -69,6 +73,30 @@ class Images:
             raise InputError(
                 f"{path}: cannot be shown ({error}); expected a PNG, JPEG or GIF"
             ) from None
+
+
+TURNS = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+"""How a photograph is turned back, by what its camera wrote of itself (EXIF), as browsers do."""
+
+LYING = (5, 6, 7, 8)
+"""Of these width and height change places."""
+
+
+def _turned(image: Image.Image) -> Any:
+    """How a camera was held; None where the file does not say, or not so that it can be read."""
+    with warnings.catch_warnings(action="ignore", category=UserWarning):
+        try:
+            return image.getexif().get(ExifTags.Base.Orientation)
+        except Exception:  # of many kinds where the tags are damaged; the picture may be whole
+            return None
 
 
 def _count(image: Image.Image) -> int:

@@ -14,11 +14,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from helpers import settings_of
 from hydra import compose, initialize_config_dir
 from scripts import run_script
 from test_cli import PARTED, ROOT, SHORT, run, start
 
 import app
+import train
 from torchrl_pref import sweeps
 from torchrl_pref.checkpoints.checkpoint import Checkpoint
 from torchrl_pref.errors import InputError
@@ -230,3 +232,16 @@ def test_jobs_run_under_a_launcher(launcher: str, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "1" / "tables.txt").stat().st_mtime_ns == before
     assert [row.get("failed") for row in sweeps.write_table(tmp_path)] == [None, None]
+
+
+def test_a_run_that_is_stopped_before_it_has_a_folder_cannot_be_gone_on_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(train, "write_text", stop)
+    with pytest.raises(KeyboardInterrupt):
+        train.start(tmp_path, {**settings_of("query"), "checkpoint": None})
+    assert "go on with" not in capsys.readouterr().out
+    assert not list(tmp_path.iterdir())

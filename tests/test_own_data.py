@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -50,6 +51,28 @@ def test_a_file(folder: Path) -> None:
     assert (folder / "run" / "figure_1.png").stat().st_size > 1000
     pool = QueryPool.load(folder / "run" / "train_pool.pt")
     assert pool.feature_names == ("speed", "lane", "jerk")
+
+
+TASKS = {
+    "driver": ["task=driver"],
+    "lds": ["task=lds"],
+    "gymnasium": ["task=gymnasium", "task.id=MountainCarContinuous-v0", "task.length=20"],
+    "files": ["task=files", "task.path=trips.csv"],
+}
+
+
+@pytest.mark.parametrize("question", ["weak", "ranking"])
+@pytest.mark.parametrize("task", TASKS)
+def test_every_task_is_trained_on_with_every_question(
+    task: str, question: str, folder: Path
+) -> None:
+    typed = [*TASKS[task], f"question={question}", "pool.size=15", "hydra.run.dir=run"]
+    done = run("train.py", *SMALL, *typed, folder=folder)
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"^RL-feed +-?\d\.\d+", done.stdout, re.M)
+    assert f"{question} questions" in done.stdout
+    for name in ("figure_1.png", "training.png", "checkpoint.pt"):
+        assert (folder / "run" / name).stat().st_size > 1000
 
 
 def test_a_bad_file_is_refused_before_a_folder_is_made(folder: Path) -> None:

@@ -198,6 +198,10 @@ def test_every_table_between_marks_is_made_by_a_part() -> None:
         assert begun == ended
         parts = [part for part, made in PARTS.items() if ROOT / made.page == page]
         assert {mark.partition("-")[0] for mark in begun} <= set(parts)
+        for mark in begun:
+            shown = text.partition(f"<!-- begin: {mark} -->\n")[2].partition("<!-- end:")[0]
+            assert shown.startswith("*Made at commit "), mark
+            assert len(shown.splitlines()) > 2, mark
     with pytest.raises(ValueError, match="no <!-- begin: nothing -->"):
         docs_figures.between("", "nothing", "")
     page = "a\n<!-- begin: x -->\nold\n<!-- end: x -->\nb"

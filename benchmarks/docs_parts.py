@@ -253,7 +253,7 @@ PARTS: dict[str, Part] = {
         2,
         docs_tables.pictures,
     ),
-    "room": benchmark("room", "docs/strategies.md", 40),
+    "room": benchmark("room", "docs/strategies.md", 70),
     "room_finer": benchmark(
         "room_finer", "docs/strategies.md", 8, '--pools 16 --only "D=8;tau unknown"', "room"
     ),

@@ -109,14 +109,14 @@ def curve(kind: Asked, typed: argparse.Namespace, seed: int) -> Tensor:
     return evaluate(env, Greedy(model, alignment_gain), draw_humans(env)).alignment.unsqueeze(0)
 
 
-def seconds(kind: Asked, typed: argparse.Namespace) -> float:
-    """Of the person's time, for one answer."""
-    return float(kind.options * typed.watch + kind.decisions * typed.decide)
+def seconds(kind: Asked, watch: float, decide: float) -> float:
+    """Of the person's time, for one answer: to watch one option, and for one decision."""
+    return kind.options * watch + kind.decisions * decide
 
 
 def row(kind: Asked, values: Tensor, typed: argparse.Namespace) -> common.Row:
     """One kind's line of the table, from alignments (P 1 B H+1)."""
-    each = seconds(kind, typed)
+    each = seconds(kind, typed.watch, typed.decide)
     cells: common.Row = {"question": kind.label, "seconds each": round(each, 1)}
     for count in (5, 10, typed.questions):
         mean, low, high = mean_and_interval(values[:, :, :, count])
@@ -138,11 +138,11 @@ def draw(curves: dict[str, Tensor], typed: argparse.Namespace) -> None:
         mean = curves[kind.label].mean((0, 1, 2))
         style = {"label": kind.label, "linestyle": "--" if kind.options == 2 else "-"}
         by_question.plot(counts, mean, **style)
-        by_second.plot(counts * seconds(kind, typed), mean, **style)
+        by_second.plot(counts * seconds(kind, typed.watch, typed.decide), mean, **style)
     by_question.set(xlabel="questions", ylabel="alignment", title="by the question")
     wait = f"{typed.watch:g} s a trajectory, {typed.decide:g} s a decision"
     by_second.set(xlabel=f"seconds of the person's time ({wait})", title="by the second")
-    by_second.set_xlim(0, typed.questions * seconds(KINDS[0], typed))
+    by_second.set_xlim(0, typed.questions * seconds(KINDS[0], typed.watch, typed.decide))
     for axes in (by_question, by_second):
         axes.grid(alpha=0.3)
     by_second.legend(loc="lower right", frameon=False)

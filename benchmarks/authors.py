@@ -20,7 +20,7 @@ from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import torch
-from torch import Generator, Tensor
+from torch import Tensor
 from tqdm import tqdm
 
 from benchmarks import common
@@ -90,9 +90,7 @@ def row(
     count: int,
 ) -> common.Row:
     """How far both are apart on controls that are drawn at random, and how long both take."""
-    shares = torch.rand(count, len(task.low), generator=Generator().manual_seed(0))
-    controls = (task.low + (task.high - task.low) * shares).double()
-    features = []
+    controls, features = task.draw(count, seed=0).double(), []
     start = time.process_time()
     for control in tqdm(as_they_take(controls).tolist(), desc=name, unit="trajectory"):
         simulator.feed(control)

@@ -420,6 +420,7 @@ def main() -> None:
     parser.add_argument("--show", default="", help="print every command with this outcome")
     typed = common.start(parser)
     commands, luck = every_command(), random.Random(typed.seed)
+    made = len(commands)
     if typed.sample is not None:
         commands = luck.sample(commands, typed.sample)
     results = []
@@ -431,7 +432,7 @@ def main() -> None:
                 print(f"{result.outcome}: {line[:300]}\n    {result.errors[-600:]!r}", flush=True)
     counts = collections.Counter(result.outcome for result in results)
     row = {"tried": len(results), **{name: counts[which] for name, which in COLUMNS.items()}}
-    common.report(f"{len(results)} of {len(every_command())} wrong commands", [row], typed.json)
+    common.report(f"{len(results)} of {made} wrong commands", [row], typed.json)
     refused = [result for result in results if result.outcome == "refused"]
     again = luck.sample(refused, min(typed.apart, len(refused)))
     differing = [result for result in again if not agrees(result)]

@@ -13,15 +13,16 @@ sys.path[0] = str(Path(__file__).resolve().parents[1])  # this folder's select.p
 
 import statistics
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import product
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Generator
 
-from benchmarks import common
+from benchmarks import common, laplace
 from torchrl_pref.acquisition.scoring import COMPILED, score_queries, together
 from torchrl_pref.beliefs.laplace import LaplaceBelief
 from torchrl_pref.beliefs.rationality import RationalityBelief
@@ -49,6 +50,11 @@ def main() -> None:
     common.report(f"CPU milliseconds: {title}", list(rows(typed.repeats)), typed.json)
 
 
+def milliseconds(call: Callable[[], Any], repeats: int) -> float:
+    """CPU time of a call, the median of so many."""
+    return 1e3 * common.paired({"": call}, repeats)[""]
+
+
 def of_metrics(repeats: int) -> Iterator[common.Row]:
     """A row for each metric."""
     pool, model = common.normalised_pool(), Boltzmann(common.TAU)
@@ -63,7 +69,7 @@ def of_metrics(repeats: int) -> Iterator[common.Row]:
         def once(name: str = name, exam: Exam = exam, ranks: torch.Tensor | None = ranks) -> None:
             measure([name], Standing(samples, omega, answers, exam, model, ranks))
 
-        yield {"metric": name, "ms": 1e3 * common.paired({name: once}, repeats)[name]}
+        yield {"metric": name, "ms": milliseconds(once, repeats)}
 
 
 def of_questions(repeats: int) -> Iterator[common.Row]:
@@ -81,7 +87,7 @@ def of_questions(repeats: int) -> Iterator[common.Row]:
                 row[f"K = {n_options}"] = ""
                 continue
             score = partial(score_queries, samples, queries, model, together(*COMPILED))
-            row[f"K = {n_options}"] = 1e3 * common.paired({"": score}, repeats)[""]
+            row[f"K = {n_options}"] = milliseconds(score, repeats)
         yield row
 
 
@@ -96,8 +102,7 @@ def of_strategies(repeats: int) -> Iterator[common.Row]:
     for name, make in STRATEGIES.items():
         strategy, row = make(env), {"strategy": name}
         for what, session in (("before the first answer", first), (f"after {LATER}", later)):
-            choose = partial(_choose, strategy, session)
-            row[what] = 1e3 * common.paired({"": choose}, repeats)[""]
+            row[what] = milliseconds(partial(_choose, strategy, session), repeats)
         yield row
 
 
@@ -117,20 +122,14 @@ def of_beliefs(repeats: int) -> Iterator[common.Row]:
     for name, belief in beliefs.items():
         row: common.Row = {"belief": name}
         for people in (1, 1000):
-            omega = uniform_sphere((people, D), generator)
-            options = torch.randn(people, 12, 2, D, generator=generator)
-            likely = model((options @ omega[:, None, :, None]).squeeze(-1)).exp()
-            answers = likely.flatten(0, 1).multinomial(1, generator=generator).view(people, 12)
-            evidence = model.evidence(options, answers)
+            _, evidence = laplace.asked(model, people, D, 12)
             samples = belief.prior(people, D, generator)
             ess = torch.full((people,), float(SAMPLES))
             for h in range(1, 12):
                 samples, ess, _ = belief.update(samples, ess, evidence[:, :h], generator)
             update = partial(belief.update, samples, ess, evidence, generator)
-            seconds = common.paired({"": update}, repeats)[""]
-            row[f"of {people:,} at once, each" if people > 1 else "of one person"] = (
-                1e3 * seconds / people
-            )
+            of = f"of {people:,} at once, each" if people > 1 else "of one person"
+            row[of] = milliseconds(update, repeats) / people
         yield row
 
 

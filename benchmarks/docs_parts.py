@@ -7,10 +7,13 @@ from itertools import product
 from typing import Any, NamedTuple
 
 from benchmarks import docs_records, docs_tables
-from benchmarks.docs_records import BEYOND, TAUS
+from benchmarks.docs_records import BELIEFS, BEYOND, SETUPS, SPREADS, TAUS
 from benchmarks.docs_tables import GALLERY, Writer
+from torchrl_pref.config.checks import PER_SECOND
+from torchrl_pref.evaluation.metrics import ALWAYS, METRICS
 from torchrl_pref.evaluation.records import CSV
 from torchrl_pref.pretrained import SEEDS
+from torchrl_pref.strategies import FEED_STRATEGIES
 
 
 class Part(NamedTuple):
@@ -33,7 +36,7 @@ class Part(NamedTuple):
 HELDOUT, SMALLER = "python evaluate.py protocol=heldout", "pool.size=300"
 MADE_FOR_IT = ",".join(
     f"torchrl_pref/policies/weights/{setup}-{tau}-{seed}.pt"
-    for setup, tau, seed in product(("query", "feed"), TAUS, range(SEEDS))
+    for setup, tau, seed in product(SETUPS, TAUS, range(SEEDS))
 )
 """The policies that were trained on the Gridworld."""
 
@@ -86,23 +89,20 @@ COSTS = {
 }
 """Where it is said what single calls take, by what they are of."""
 
-METRICS = "[accuracy,log_likelihood,regret,rank_correlation,calibration]"
+EVERY_METRIC = f"evaluation.metrics=[{','.join(name for name in METRICS if name not in ALWAYS)}]"
 
 
 def on_beliefs() -> Iterator[str]:
     """People of one tau, and of many, before beliefs that are told it, or another, or nothing."""
-    told = {"told": "tau=4.4", "told_more": "tau=17.6", "told_less": "tau=1.1"}
-    told["inferred"] = "tau=4.4 belief=rationality"
     line = "python evaluate.py setup=query pool.size=300 evaluation.humans=150 human.tau=4.4"
-    for spread, (name, typed) in product((1, 4), told.items()):
+    for spread, (name, (typed, _)) in product(SPREADS.values(), BELIEFS.items()):
         run = f"{name}_{spread}"
-        more = f"{typed} human.spread={spread} evaluation.metrics={METRICS}"
+        more = f"{typed} human.spread={spread} {EVERY_METRIC}"
         yield f"{line} {more} hydra.run.dir={{folder}}/{run} -> {run}/{CSV}"
 
 
-RULES = ["information_gain", "alignment_gain", "volume_removal", "least_confidence"]
-RULES += ["max_regret", "disagreement", "thompson", "knowledge_gradient"]
-"""All that need no model of time."""
+COMPARED = [name for name in FEED_STRATEGIES if name not in ("random", *PER_SECOND)]
+"""Strategies of both setups that need no model of time."""
 
 SWEEP = "hydra.sweep.dir={folder}/sweep"
 TWO = "hydra/launcher=joblib hydra.launcher.n_jobs=2"
@@ -110,11 +110,8 @@ CELLS = [f"{setup}-{tau}" for setup in ("feed", "query") for tau in ("noisy", "o
 MORE = 31
 """Runs of the cell in which one training tells least, with other seeds."""
 
-
-def sweep_of(count: int) -> list[str]:
-    """The folders of so many jobs."""
-    return [f"sweep/{job}" for job in range(count)]
-
+JUDGED = (*CELLS, *(f"sweep/{job}" for job in range(MORE)))
+"""The folders of all runs that stand beside the package's policies."""
 
 SHEET = "python -m torchrl_pref.tasks {task} --animate --out {{folder}}/{task}.png -> {task}.gif"
 PENDULUM = "python examples/pendulum_file.py {folder}/pendulum.csv 2000 -> pendulum.csv"
@@ -219,7 +216,7 @@ PARTS: dict[str, Part] = {
             f"seed={','.join(map(str, range(1, 1 + MORE)))} {TWO} "
             f"hydra.sweep.dir={{folder}}/runs/sweep -> runs/sweep/{MORE - 1}/tables.txt",
             "python benchmarks/quality.py "
-            f"{' '.join(f'{{folder}}/runs/{run}' for run in (*CELLS, *sweep_of(MORE)))} "
+            f"{' '.join(f'{{folder}}/runs/{run}' for run in JUDGED)} "
             "--json {folder}/quality.json -> quality.json",
         ),
         40,
@@ -284,9 +281,9 @@ PARTS: dict[str, Part] = {
     "strategies": Part(
         "docs/strategies.md",
         tuple(
-            f"python evaluate.py setup={setup} strategy=[{','.join(RULES)}] "
+            f"python evaluate.py setup={setup} strategy=[{','.join(COMPARED)}] "
             f"hydra.run.dir={{folder}}/{setup} -> {setup}/{CSV}"
-            for setup in docs_records.SETUPS
+            for setup in SETUPS
         ),
         10,
         docs_records.strategies,

@@ -14,7 +14,7 @@ from torchrl_pref.evaluation.figures import figure_1, heldout_figure
 from torchrl_pref.evaluation.metrics import METRICS
 from torchrl_pref.evaluation.records import CSV, Records, read_records
 from torchrl_pref.evaluation.style import is_feed, is_judged, kind_of, name_of
-from torchrl_pref.evaluation.tables import signed, title_of
+from torchrl_pref.evaluation.tables import title_of, with_interval
 from torchrl_pref.evaluation.views import (
     alignment,
     answers_to_reach,
@@ -24,7 +24,7 @@ from torchrl_pref.evaluation.views import (
     milestones,
 )
 
-TAUS = ("noisy", "optimal")
+SETUPS, TAUS = ("query", "feed"), ("noisy", "optimal")
 
 RULES = ("greedy_information", "greedy_alignment")
 """The two that no training is needed for."""
@@ -71,8 +71,8 @@ def heldout_rows(records: Records) -> Rows:
             f"after {half}": f"{values[..., half].mean():.3f}",
             f"after {budget}": f"{values[..., -1].mean():.3f}",
             f"mean of 1 to {budget}": f"{values[..., 1:].mean():.3f}",
-            f"RL minus it, after {budget}": "" if key == policy else interval(gap[..., -1]),
-            "RL minus it, mean": "" if key == policy else interval(gap[..., 1:].mean(-1)),
+            f"RL minus it, after {budget}": "" if key == policy else with_interval(gap[..., -1]),
+            "RL minus it, mean": "" if key == policy else with_interval(gap[..., 1:].mean(-1)),
             f"reaches {level:.3f} after": answers_to_reach(records, key, level),
             "bits": f"{records.values(key, 'information').mean():.2f}",
         }
@@ -83,12 +83,6 @@ def heldout_rows(records: Records) -> Rows:
         row["ms to choose"] = f"{1000 * records.values(key, 'seconds_to_choose').mean():.2f}"
         rows.append(row)
     return rows
-
-
-def interval(gap: Tensor) -> str:
-    """Mean of paired differences, with its 95% interval."""
-    mean, low, high = mean_and_interval(gap)
-    return signed(mean, (low, high))
 
 
 def paper(folder: Path) -> dict[str, str]:
@@ -104,7 +98,7 @@ def paper(folder: Path) -> dict[str, str]:
             row[title] = f"{alignment(own, key)[..., -1].mean():.3f}"
             for policy in filter(is_judged, own.strategies):
                 gap = difference(own, policy, key)[..., -1]
-                other_row[f"{name_of(policy)}, {title}"] = interval(gap)
+                other_row[f"{name_of(policy)}, {title}"] = with_interval(gap)
         final.append(row)
         if kind_of(key) in ("random", "greedy_information"):
             apart.append(other_row)
@@ -142,7 +136,7 @@ def objectives(folder: Path) -> dict[str, str]:
 def beside_information(name: str, records: Records, key: str) -> dict[str, str]:
     """A strategy on the way and in the end, with its difference to information gain."""
     less = minus_information(records, key)
-    last = "" if less is None else interval(less[..., -1])
+    last = "" if less is None else with_interval(less[..., -1])
     return {**on_the_way(name, records, key), "minus information_gain, last": last}
 
 
@@ -197,7 +191,9 @@ def literature_row(records: Records, key: str) -> dict[str, str]:
     return {
         **on_the_way(name, records, key),
         "mean of 1 to 20": f"{alignment(records, key)[..., 1:].mean():.3f}",
-        "minus information_gain, mean": "" if less is None else interval(less[..., 1:].mean(-1)),
+        "minus information_gain, mean": ""
+        if less is None
+        else with_interval(less[..., 1:].mean(-1)),
     }
 
 
@@ -223,7 +219,7 @@ def beside_rules(setup: str, records: Records) -> dict[str, str]:
     information, rule_alignment = f"{rule}_information", f"{rule}_alignment"
 
     def gap(first: str, second: str) -> str:
-        return interval(difference(records, first, second)[..., 1:].mean(-1))
+        return with_interval(difference(records, first, second)[..., 1:].mean(-1))
 
     return {
         "by information": f"{alignment(records, information)[..., 1:].mean():.3f}",
@@ -250,7 +246,7 @@ BEYOND = {
 def beyond(folder: Path) -> dict[str, str]:
     """The policy for every task beside both rules where questions or beliefs are others."""
     rows = []
-    for setup, name in product(("query", "feed"), BEYOND):
+    for setup, name in product(SETUPS, BEYOND):
         records = read_records(folder / name / CSV)
         cell = next(cell for cell in records.tasks if cell.startswith(setup))
         row = beside_rules(setup, records.of_task(cell))
@@ -259,35 +255,31 @@ def beyond(folder: Path) -> dict[str, str]:
 
 
 BELIEFS = {
-    "told": "told tau 4.4",
-    "told_more": "told 17.6, four times too careful",
-    "told_less": "told 1.1",
-    "inferred": "inferred",
+    "told": ("tau=4.4", "told tau 4.4"),
+    "told_more": ("tau=17.6", "told 17.6, four times too careful"),
+    "told_less": ("tau=1.1", "told 1.1"),
+    "inferred": ("tau=4.4 belief=rationality", "inferred"),
 }
-"""Beliefs of people's tau, by the name of their evaluation."""
+"""Beliefs of people's tau, by the name of their evaluation: what is typed, and what it is."""
 
-VALUES = {"alignment": "mean of cosines", "alignment_of_mean": "cosine of mean"}
-"""Heads of columns; of other metrics their names."""
+SPREADS = {"metrics": 1, "metrics-spread": 4}
+"""Within which factor people's tau is, by the mark of the table."""
 
 
 def metrics(folder: Path) -> dict[str, str]:
     """What every metric says of beliefs that are right or wrong about people's tau."""
     tables = {}
-    for spread, mark in (("1", "metrics"), ("4", "metrics-spread")):
+    for mark, spread in SPREADS.items():
         rows = []
-        for belief, what in BELIEFS.items():
+        for belief, (_, what) in BELIEFS.items():
             records = read_records(folder / f"{belief}_{spread}" / CSV)
             records = records.of_task(records.tasks[0])  # and not of a belief that is right
             row = {"belief": what}
-            for name in (*VALUES, *METRICS):
-                values = measured(records, RULES[0], name)[..., -1]
-                row[VALUES.get(name, name.replace("_", " "))] = f"{values.mean():.3f}"
+            for name, metric in METRICS.items():
+                row[metric.head] = f"{measured(records, RULES[0], name)[..., -1].mean():.3f}"
             rows.append(row)
         tables[mark] = table(rows)
     return tables
-
-
-SETUPS = ("query", "feed")
 
 
 def strategies(folder: Path) -> dict[str, str]:

@@ -22,7 +22,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[0] = str(ROOT)  # and not this folder, whose select.py would hide Python's own
 
-from collections.abc import Callable, Sequence
+import argparse
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -295,24 +296,44 @@ def row_of(name: str, found: Found, tried: Sequence[str]) -> common.Row:
     }
 
 
+def arguments(description: str | None, humans: int) -> argparse.ArgumentParser:
+    """A parser with what looking for room takes, and by default so many humans."""
+    parser = common.arguments(description)
+    parser.add_argument("--pools", type=int, default=8, help="in each corner (default 8)")
+    of_each = f"of each pool (default {humans})"
+    parser.add_argument("--humans", type=int, default=humans, help=of_each)
+    parser.add_argument("--only", help="corners, by semicolons")
+    return parser
+
+
+def chosen(
+    parser: argparse.ArgumentParser, typed: argparse.Namespace, corners: Iterable[str]
+) -> list[str]:
+    """The corners that were typed, or all; refused where there is no such one."""
+    names: list[str] = typed.only.split(";") if typed.only else list(corners)
+    if unknown := [name for name in names if name not in corners]:
+        parser.error(f"--only {unknown[0]}: expected some of {'; '.join(corners)}")
+    return names
+
+
+def check_pools(parser: argparse.ArgumentParser, pools: int) -> None:
+    """Refuse a single pool."""
+    if pools < 2:
+        parser.error("--pools: expected at least 2, to choose on some and to judge on others")
+
+
 def main() -> None:
     """Print the table."""
-    parser = common.arguments(__doc__)
-    parser.add_argument("--pools", type=int, default=8, help="in each corner (default 8)")
-    parser.add_argument("--humans", type=int, default=125, help="of each pool (default 125)")
+    parser = arguments(__doc__, humans=125)
     parser.add_argument("--setup", default="query", choices=list(TRIED), help="(default query)")
-    parser.add_argument("--only", help="corners, by semicolons")
     many = "checkpoints or run folders, to be tried instead of the rules"
     parser.add_argument("--policies", nargs="+", type=Path, default=[], help=many)
     typed = common.start(parser)
-    if typed.pools < 2 and not typed.policies:
-        parser.error("--pools: expected at least 2, to choose on some and to judge on others")
+    if not typed.policies:
+        check_pools(parser, typed.pools)
     corners = {**CORNERS, **OF_FEEDS} if typed.setup == "feed" else CORNERS
-    names = typed.only.split(";") if typed.only else list(corners)
-    if unknown := [name for name in names if name not in corners]:
-        parser.error(f"--only {unknown[0]}: expected some of {'; '.join(corners)}")
     policies, rows = {str(path): trained(path) for path in typed.policies}, []
-    for name in tqdm(names, desc="corners"):
+    for name in tqdm(chosen(parser, typed, corners), desc="corners"):
         corner = replace(Corner(), **corners[name])
         found = measure(corner, typed.setup, typed.pools, typed.humans, policies)
         tried = TRIED[typed.setup]

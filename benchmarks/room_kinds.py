@@ -36,9 +36,9 @@ from benchmarks import answers, common, room
 from torchrl_pref.acquisition.functions import Acquisition, alignment_gain, information_gain
 from torchrl_pref.acquisition.scoring import predict_answers, score_queries
 from torchrl_pref.beliefs.sampled import Belief, uniform_sphere
+from torchrl_pref.pool import QueryPool
 from torchrl_pref.questions import QUESTIONS
 from torchrl_pref.questions.base import Evidence
-from torchrl_pref.questions.calibrate import calibrate_tau
 from torchrl_pref.questions.responses import Boltzmann
 from torchrl_pref.strategies.lookahead import Ahead
 
@@ -262,17 +262,15 @@ def _with(told: Evidence, asks: Tensor, newest: Evidence) -> Evidence:
 
 def asking_in(corner: Corner, number: int) -> Asking:
     """A pool of a corner, and what may be asked of it."""
-    of_four = room.Corner(corner.dimension, corner.skew, options=4, size=300)
+    of_four = room.Corner(corner.dimension, corner.skew, 4, size=300, accuracy=corner.accuracy)
     features = room.normalised(of_four, number).features
-    omega = uniform_sphere((1000, corner.dimension), Generator().manual_seed(0))
-    returns = torch.einsum("nkd,md->nmk", features[:, :2], omega)
-    tau = calibrate_tau(returns, corner.accuracy)
+    tau = room.model_for(of_four, QueryPool(features[:, :2])).scale
     kinds = [
         Kind(
             kind.label,
             Boltzmann(tau, QUESTIONS[kind.name]()),
             kind.options,
-            kind.options * corner.watch + kind.decisions * corner.decide,
+            answers.seconds(kind, corner.watch, corner.decide),
         )
         for kind in answers.KINDS
         if kind.label in LABELS
@@ -282,18 +280,11 @@ def asking_in(corner: Corner, number: int) -> Asking:
 
 def main() -> None:
     """Print the table."""
-    parser = common.arguments(__doc__)
-    parser.add_argument("--pools", type=int, default=8, help="in each corner (default 8)")
-    parser.add_argument("--humans", type=int, default=100, help="of each pool (default 100)")
-    parser.add_argument("--only", help="corners, by semicolons")
+    parser = room.arguments(__doc__, humans=100)
     typed = common.start(parser)
-    if typed.pools < 2:
-        parser.error("--pools: expected at least 2, to choose on some and to judge on others")
-    names = typed.only.split(";") if typed.only else list(CORNERS)
-    if unknown := [name for name in names if name not in CORNERS]:
-        parser.error(f"--only {unknown[0]}: expected some of {'; '.join(CORNERS)}")
+    room.check_pools(parser, typed.pools)
     rows = []
-    for name in tqdm(names, desc="corners"):
+    for name in tqdm(room.chosen(parser, typed, CORNERS), desc="corners"):
         corner, found = replace(Corner(), **CORNERS[name]), room.Found(baseline=BASELINE)
         for number in tqdm(range(typed.pools), desc="pools", leave=False):
             asking = asking_in(corner, number)

@@ -143,6 +143,13 @@ def trained_in_parts(settings: dict[str, Any], parts: list[int], folder: Path) -
     return Checkpoint.load(path)
 
 
+def chi_square(ranks: Tensor) -> float:
+    """How uneven ranks (B) among 99 samples are, in ten bins, so with 9 degrees of freedom: 33.7 is
+    exceeded once in 10,000."""
+    expected = len(ranks) / 10
+    return float(((torch.histc(ranks.float(), 10, 0, 99) - expected).square() / expected).sum())
+
+
 def same(first: Any, second: Any) -> bool:
     """Whether two nests of plain data and tensors are equal to the last bit; NaN equals NaN."""
     if isinstance(first, dict):

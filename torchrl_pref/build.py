@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -32,6 +32,9 @@ from torchrl_pref.tasks.base import make_pool
 
 ANSWERING = ("tau", "lapse")
 """Settings of a human, or of a belief, that are of the response model, and not of their kind."""
+
+USUAL_HUMAN = cast(GroupSection, {"name": "simulated", "spread": 1, "tau": None, "lapse": 0.0})
+"""The section of humans in whom nothing is particular."""
 
 LARGEST = 1e15
 """Of a feature that a policy can read."""
@@ -151,11 +154,10 @@ def make_task(
 
 def _kind_of(section: GroupSection) -> str:
     """What is particular to a kind of human beside tau and lapses, in words."""
-    usual = {"name": "simulated", "make": None, "spread": 1}
     name = section.get("make", section["name"])
-    words = [] if name == usual["name"] else [str(name)]
+    words = [] if name == USUAL_HUMAN["name"] else [str(name)]
     for key, value in section.items():
-        if key not in (*ANSWERING, "name", "make") and value != usual.get(key):
+        if key not in (*ANSWERING, "name", "make") and value != USUAL_HUMAN.get(key):
             words.append(f"{key}={value}")
     return " ".join(words)
 

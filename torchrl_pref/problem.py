@@ -85,9 +85,12 @@ class Problem:
             who = f"{who}, {named(self.question)}"
         if not self.mistakes:
             return who
-        assumed = "optimal" if self.tau is None else f"tau={self.tau:.4g}"
         beside = f", lapse={self.belief_lapse:g}" if self.belief_lapse else ""
-        return f"{who}; assumed {assumed}{beside}"
+        return f"{who}; assumed {self._assumed}{beside}"
+
+    @property
+    def _assumed(self) -> str:
+        return "optimal" if self.tau is None else f"tau={self.tau:.4g}"
 
     @property
     def response_model(self) -> ResponseModel:
@@ -113,7 +116,7 @@ class Problem:
         if human.kind:
             found.append(human.kind)
         if human.tau != self.tau:
-            found.append("optimal" if self.tau is None else f"tau={self.tau:.4g}")
+            found.append(self._assumed)
         if human.lapse != self.belief_lapse:
             found.append(f"lapse={self.belief_lapse:g}")
         return found

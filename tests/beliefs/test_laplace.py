@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 import torch
+from helpers import chi_square
 from torch import Generator, Tensor
 
 from torchrl_pref.beliefs import laplace
@@ -136,9 +137,7 @@ def test_calibration(
     samples, _, _ = belief.update(samples, ess, model.evidence(options, answers), generator)
     ranks = (samples < omega.unsqueeze(1)).sum(1)
     for rank in ranks.unbind(-1)[:8]:
-        counts = torch.histc(rank.float(), 10, 0, 99)
-        # 9 degrees of freedom: 33.7 is exceeded once in 10,000.
-        assert ((counts - sessions / 10).square() / (sessions / 10)).sum() < 33.7
+        assert chi_square(rank) < 33.7
     assert least < ((ranks >= 10) & (ranks < 90)).double().mean() < 0.82  # 80%
 
 

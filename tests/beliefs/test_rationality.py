@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from helpers import chi_square
 from reference import answer_probs
 from torch import Generator, Tensor
 
@@ -76,9 +77,7 @@ def test_calibration(
     ranks = [(directions(samples)[..., d] < omega[:, None, d]).sum(1) for d in range(n_features)]
     ranks.append((samples.norm(dim=-1).log() < log_s[:, None]).sum(1))
     for rank in ranks:
-        counts = torch.histc(rank.float(), 10, 0, 99)
-        # 9 degrees of freedom: 33.7 is exceeded once in 10,000.
-        assert ((counts - sessions / 10).square() / (sessions / 10)).sum() < 33.7
+        assert chi_square(rank) < 33.7
 
 
 def reference(

@@ -9,8 +9,8 @@ import pytest
 import torch
 from helpers import settings_of, trainer_of
 
-from torchrl_pref.build import make_pools, make_query_env, make_task
-from torchrl_pref.evaluation.misjudged import USUAL, evaluate_misjudged, judged_rightly
+from torchrl_pref.build import USUAL_HUMAN, make_pools, make_query_env, make_task
+from torchrl_pref.evaluation.misjudged import evaluate_misjudged, judged_rightly
 from torchrl_pref.evaluation.records import CSV, Records, read_records, write_records
 from torchrl_pref.evaluation.run import draw_humans
 from torchrl_pref.evaluation.tables import misjudging, tables
@@ -21,11 +21,11 @@ from torchrl_pref.problem import Problem
 from torchrl_pref.training.start import make_checkpoint
 
 OTHERS: dict[str, dict[str, Any]] = {
-    "tau": {"human": {**USUAL, "tau": 1.0}},
-    "lapse": {"human": {**USUAL, "lapse": 0.2}},
+    "tau": {"human": {**USUAL_HUMAN, "tau": 1.0}},
+    "lapse": {"human": {**USUAL_HUMAN, "lapse": 0.2}},
     "no lapse": {"belief.lapse": 0.2},
-    "spread": {"human": {**USUAL, "spread": 4.0}},
-    "never errs": {"human": {**USUAL, "tau": "optimal"}},
+    "spread": {"human": {**USUAL_HUMAN, "spread": 4.0}},
+    "never errs": {"human": {**USUAL_HUMAN, "tau": "optimal"}},
     "skipping": {"human": {"name": "skipping", "threshold": 0.0, "tau": None, "lapse": 0.0}},
     "drifting": {"human": {"name": "drifting", "drift": 0.1, "tau": 1.0, "lapse": 0.0}},
 }

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import cast
 
 import torch
 
-from torchrl_pref.build import make_query_env
+from torchrl_pref.build import USUAL_HUMAN, make_query_env
 from torchrl_pref.checkpoints.checkpoint import Checkpoint
-from torchrl_pref.config.sections import GroupSection, Settings
+from torchrl_pref.config.sections import Settings
 from torchrl_pref.errors import InputError
 from torchrl_pref.evaluation.comparison import evaluate_task, try_strategies
 from torchrl_pref.evaluation.own import Maker
@@ -18,9 +17,6 @@ from torchrl_pref.evaluation.records import MISJUDGED, REFERENCE, Records
 from torchrl_pref.evaluation.run import draw_humans
 from torchrl_pref.pool import QueryPool
 from torchrl_pref.problem import Problem
-
-USUAL = cast(GroupSection, {"name": "simulated", "spread": 1, "tau": None, "lapse": 0.0})
-"""Humans in whom nothing is particular."""
 
 
 def evaluate_misjudged(
@@ -60,7 +56,7 @@ def judged_rightly(
     if not task.mistakes:
         return None
     right = task.judging_rightly()
-    there: Settings = {**settings, "human": USUAL}
+    there: Settings = {**settings, "human": USUAL_HUMAN}
     try:
         try_strategies(own, there, right)
         envs = (make_query_env(s, t, t.test, 2, 0) for s, t in ((settings, task), (there, right)))

@@ -36,6 +36,12 @@ def signed(mean: float, interval: tuple[float, float]) -> str:
     return "{:+.3f} [{:+.3f}, {:+.3f}]".format(mean, *interval)
 
 
+def with_interval(differences: Tensor) -> str:
+    """The mean of differences (P S B) and its 95% interval, as tables show them."""
+    mean, low, high = mean_and_interval(differences)
+    return signed(mean, (low, high))
+
+
 def tables(records: Records) -> str:
     """All tables of an evaluation, and what is to be said of them."""
     parts = []
@@ -146,10 +152,9 @@ def misjudging(records: Records, task: str) -> list[str]:
         row = {"strategy": name_of(key)}
         for metric in ALWAYS:
             mine, others = (measured(each, key, metric)[..., -1] for each in (own, right))
-            mean, *ends = mean_and_interval(mine - others)
             head = METRICS[metric].head
             row[head] = f"{mine.mean():.3f}"
-            row[f"{head}, minus rightly [95%]"] = signed(mean, (ends[0], ends[1]))
+            row[f"{head}, minus rightly [95%]"] = with_interval(mine - others)
         if own.has(key, "calibration") and right.has(key, "calibration"):
             errors = (measured(each, key, "calibration")[..., -1].mean() for each in (own, right))
             row["calibration"], row["calibration, rightly"] = (f"{error:.3f}" for error in errors)
@@ -236,5 +241,4 @@ def many_repeats(records: Records) -> list[str]:
 def _difference(records: Records, key: str, other: str, on_the_way: bool = False) -> str:
     """Of alignments after the last query or, on the way, of their means over all queries."""
     gap = difference(records, key, other)
-    mean, low, high = mean_and_interval(gap[..., 1:].mean(-1) if on_the_way else gap[..., -1])
-    return signed(mean, (low, high))
+    return with_interval(gap[..., 1:].mean(-1) if on_the_way else gap[..., -1])

@@ -33,6 +33,10 @@ class ControlledTask(Task):
 
     def trajectories(self, count: int, seed: int) -> Tensor:
         """See :meth:`Task.trajectories`: each control is drawn uniformly between its bounds."""
+        return self.roll_out(self.draw(count, seed))
+
+    def draw(self, count: int, seed: int) -> Tensor:
+        """Controls (count U), each uniform between its bounds."""
         generator = Generator().manual_seed(seed)
         shares = torch.rand(count, len(self.low), generator=generator)
-        return self.roll_out(self.low + (self.high - self.low) * shares)
+        return self.low + (self.high - self.low) * shares

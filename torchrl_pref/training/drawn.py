@@ -13,7 +13,13 @@ import torch
 from tensordict import TensorDict
 from torch import Generator
 
-from torchrl_pref.build import make_policy, make_pools, make_task, make_training_env
+from torchrl_pref.build import (
+    USUAL_HUMAN,
+    make_policy,
+    make_pools,
+    make_task,
+    make_training_env,
+)
 from torchrl_pref.config.sections import Settings
 from torchrl_pref.policies.base import Policy
 from torchrl_pref.training.sessions import Sessions
@@ -126,12 +132,7 @@ def draw_problem(settings: Settings, luck: Generator) -> Settings:
             "options": options,
             "seed": _whole(luck, 0, LARGEST_SEED - 1),
         },
-        "human": {
-            "name": "simulated",
-            "spread": SPREAD if unsure else 1,
-            "tau": None,
-            "lapse": 0.0,
-        },
+        "human": {**USUAL_HUMAN, "spread": SPREAD if unsure else 1},
         "belief": {**known, "name": "rationality", "spread": SPREAD} if unsure else known,
         "setup": setup,
     }

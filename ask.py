@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from torchrl_pref.study.materials import Materials
     from torchrl_pref.study.study import Study
 
-CONFIG, POOL, LOG = "config.yaml", "pool.pt", "study.db"
+CONFIG, POOL, LOG = "config.yaml", "pool.pt", runs.STUDY
 """The files of a study; with the log it has begun."""
 
 OF_THE_MACHINE = ("host", "port", "open", "threads")
@@ -97,17 +97,24 @@ def check_installed() -> None:
 
 def begin(folder: Path, settings: Plain) -> None:
     """A new study, in the folder made for it."""
-    if (folder / LOG).exists() or (folder / CONFIG).exists():
+    if (folder / LOG).exists():
         raise InputError(
-            f"{folder} holds a study or a run already; go on with a study by: "
+            f"{folder} holds a study already; go on with it by: "
             f"{app.command(app.as_typed('resume', folder))}, or name another folder by "
             "hydra.run.dir="
         )
+    if (folder / CONFIG).exists():
+        raise InputError(f"{folder} holds a run of train.py; name another folder by hydra.run.dir=")
     from torchrl_pref.study.materials import draw_pool, make_materials
 
     with runs.claimed(folder), way_to_ask(folder, settings) as ask:
         app.use_threads(settings)
         raw = draw_pool(settings)
+        if settings["pool"]["file"] is None and len(raw) < settings["pool"]["size"]:
+            print(
+                f"note: {len(raw)} queries; the task has no more, and "
+                f"pool.size={settings['pool']['size']} asks for more"
+            )
         materials = make_materials(settings, raw)  # or it is refused, before anything is written
         raw.save(folder / POOL)
         write_text(folder / CONFIG, OmegaConf.to_yaml(OmegaConf.create(settings)))

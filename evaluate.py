@@ -82,6 +82,11 @@ def job(config: DictConfig) -> None:
                     f"{folder} holds a run, whose tables and figures would be overwritten; name "
                     "another folder by hydra.run.dir="
                 )
+            if (folder / runs.TABLES).exists():
+                raise InputError(
+                    f"{folder} holds an evaluation already; remove it, or name another folder by "
+                    "hydra.run.dir="
+                )
             evaluate(check(typed.plain_settings(config)), folder)
     finally:
         app.discard_if_empty(folder)

@@ -77,6 +77,7 @@ def run(config: DictConfig, made: Path) -> float:
     with runs.claimed(made):
         if not any((made / name).exists() for name in RUN):
             return begin(made, settings)
+        refuse_study(made)
         if not app.in_sweep():
             raise InputError(
                 f"{made} holds a run already; go on with it by: "
@@ -101,6 +102,7 @@ def run_folder(path: Path) -> Path:
     if path.is_file():
         check_trained(path, Checkpoint.load(path))
         path = path.parent
+    refuse_study(path)
     if not any((path / name).exists() for name in (CHECKPOINT, CONFIG)):
         found = "holds no run" if path.is_dir() else "no such file or folder"
         raise InputError(
@@ -108,6 +110,18 @@ def run_folder(path: Path) -> Path:
             f"{CONFIG}; check the path, or start a new run there by hydra.run.dir="
         )
     return path.resolve()
+
+
+def refuse_study(folder: Path) -> None:
+    """Refuse a folder of ``ask.py``.
+
+    Raises:
+        InputError: it is one.
+    """
+    if (folder / runs.STUDY).exists():
+        raise InputError(
+            f"{folder} holds a study of ask.py, and no run; name another folder by hydra.run.dir="
+        )
 
 
 def refuse_other_run(folder: Path, settings: Settings) -> None:

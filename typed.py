@@ -121,8 +121,8 @@ def _several(text: str) -> str | None:
         return None
     key, values = found.groups()
     return (
-        f"{key}={values}: several values; expected a list in brackets, as in '{key}=[{values}]', "
-        "or -m before it, to run with each of them"
+        f"{key}={values}: several values; expected -m before it, to run with each of them; or, of "
+        f"what takes a list, brackets and quotes, as in '{key}=[{values}]'"
     )
 
 

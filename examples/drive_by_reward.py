@@ -1,8 +1,7 @@
 """Learn how somebody wants a car to drive, then drive like that.
 
-A simulated person answers 20 questions about pairs of drives. What they said becomes a reward, and
-the controls of a car are improved by its gradient, through the car's dynamics. It leaves the reward
-and a picture of a drive before and after: python examples/drive_by_reward.py [folder]
+A simulated person answers 20 questions about pairs of drives. The reward that follows improves the
+controls of a car by its gradient, and is left with a picture of before and after in [folder].
 """
 
 import sys
@@ -16,6 +15,7 @@ from torchrl_pref.tasks.drawing import save_picture
 from torchrl_pref.tasks.driver import DriverTask
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else ".")
+folder.mkdir(parents=True, exist_ok=True)
 torch.set_num_threads(1)
 task, model = DriverTask(), Boltzmann(tau=4.0)
 raw = make_pool(task, n_queries=500, n_options=2, seed=0)

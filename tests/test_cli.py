@@ -189,6 +189,7 @@ def test_sweep_makes_one_table(tmp_path: Path) -> None:
     assert (tmp_path / "all" / "figure_2.png").exists()
     ahead = "strategy=lookahead", f"hydra.run.dir={tmp_path}/ahead"
     assert "lookahead" in run("evaluate.py", f"checkpoint={tmp_path}/other/0", *ahead)
+    ahead = "strategy=lookahead", f"hydra.run.dir={tmp_path}/refused"
     refused = run_script("evaluate.py", f"checkpoint={tmp_path}/sweep/2", *ahead, folder=ROOT)
     assert "strategy=lookahead with setup=feed: it is for setup=query alone" in refused.stderr
 
@@ -319,7 +320,7 @@ BAD_INPUT = [
     ("train", "tau=nan", "tau=nan: expected a finite number above 0"),
     ("train", "tau=loud", "tau='loud': expected noisy, optimal or a number above 0"),
     ("train", "tau=[1,2]", "tau=[1, 2]: expected a finite number above 0"),
-    ("train", "belief.samples=1", "belief.samples=1: expected a whole number of at least 2"),
+    ("train", "belief.samples=1", "belief.samples=1: expected a whole number of at least 8"),
     ("train", "belief.samples=many", "belief.samples='many': expected a whole number"),
     ("train", "pool.options=1", "pool.options=1: expected a whole number of at least 2"),
     ("train", "pool.size=4e1", "pool.size=40.0: expected a whole number, without a point"),
@@ -502,6 +503,29 @@ def test_a_run_is_never_overwritten(tmp_path: Path) -> None:
     assert process.returncode == 2
     assert "holds a run already" in errors
     assert os.listdir(tmp_path) == ["train_pool.pt"]
+
+
+@pytest.mark.parametrize(
+    ("there", "typed", "message"),
+    [
+        ("study.db", "train.py hydra.run.dir={}", "holds a study of ask.py, and no run"),
+        ("study.db", "train.py resume={}", "holds a study of ask.py, and no run"),
+        ("study.db", "ask.py hydra.run.dir={}", "go on with it by"),
+        ("config.yaml", "ask.py hydra.run.dir={}", "holds a run of train.py"),
+        ("tables.txt", "evaluate.py hydra.run.dir={}", "holds an evaluation already"),
+    ],
+)
+def test_what_a_folder_holds_is_named(there: str, typed: str, message: str, tmp_path: Path) -> None:
+    for name in ("config.yaml", there):
+        (tmp_path / name).write_text("somebody's")
+    if there == "tables.txt":
+        (tmp_path / "config.yaml").unlink()
+    before = sorted(os.listdir(tmp_path))
+    done = run_script(*typed.format(tmp_path).split())
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert sorted(os.listdir(tmp_path)) == before
 
 
 def test_folders_that_the_user_made_are_kept(tmp_path: Path) -> None:

@@ -152,6 +152,8 @@ def test_what_is_no_reward_or_no_features_is_refused(
         Reward.of(session).score(torch.zeros(4))
     with pytest.raises(InputError, match="features: NaN"):
         Reward.of(session).score(torch.tensor([[1.0, math.nan, 3.0]]))
+    with pytest.raises(InputError, match="features: NaN"):
+        Reward.of(session)(TensorDict({"next": {"features": torch.full((2, 3), math.nan)}}, [2]))
     with pytest.raises(InputError, match="features of <class 'list'>"):
         Reward.of(session).score([1.0, 2.0, 3.0])
     with pytest.raises(InputError, match="cannot be written"):

@@ -292,6 +292,7 @@ def test_what_is_no_answer_changes_nothing(answer: Any, generator: Generator) ->
         {"response_model": "Boltzmann(tau=4)"},
         {"asked": [50]},
         {"answer": [[0], [1]]},
+        {"budget": 2, "asked": [3]},
     ],
 )
 def test_spoiled_sessions_are_refused(spoil: dict[str, Any], generator: Generator) -> None:
@@ -301,6 +302,22 @@ def test_spoiled_sessions_are_refused(spoil: dict[str, Any], generator: Generato
     with pytest.raises(InputError) as error:
         Session.from_dict({**session.to_dict(), **spoil}, features, MODEL)
     assert "\n" not in str(error.value)
+
+
+def test_what_a_page_makes_of_an_index_is_not_the_session_s(generator: Generator) -> None:
+    session = Session(torch.randn(20, 2, 3, generator=generator), MODEL)
+    index = session.ask().query
+    before = int(index)
+    index += 1
+    session.tell(0)
+    assert session.to_dict()["queries"] == [[before]]
+
+
+def test_returns_whose_squares_are_too_large_have_a_deviation(generator: Generator) -> None:
+    session = Session(torch.randn(20, 2, 3, generator=generator), MODEL)
+    mean, deviation = session.score(torch.tensor([[1e38, 1e38, -1e38]]))
+    assert mean.isfinite().all()
+    assert 0 < float(deviation) < 2e38
 
 
 def test_raw_features_are_normalised_where_the_session_knows_how() -> None:
@@ -501,7 +518,11 @@ def test_what_is_known_is_told_as_counted_by_hand(generator: Generator) -> None:
     assert session.likelihoods.tolist() == pytest.approx(fits, abs=1e-5)
     alignment = session.expected_alignment
     assert len(alignment) == 5
-    assert float(alignment[-1]) == pytest.approx(float(samples.mean(0).norm()), abs=1e-5)
+    cosines = samples @ samples.mT
+    others = float((cosines.sum() - cosines.trace()) / (len(samples) * (len(samples) - 1)))
+    length = float(samples.mean(0).norm())
+    assert float(alignment[-1]) == pytest.approx(others / length, abs=1e-5)
+    assert 0 <= float(alignment[0]) < 0.1  # nothing was known
     assert alignment[-1] == alignment[-2]  # nothing was said
     options = session.ask().features.double()
     first = 1 / (1 + (-2.0 * samples @ (options[0] - options[1])).exp())
@@ -509,5 +530,8 @@ def test_what_is_known_is_told_as_counted_by_hand(generator: Generator) -> None:
     for probability in (first, 1 - first):
         mean = (probability[:, None] * samples).mean(0) / probability.mean()
         expected += float(probability.mean() * mean.square().sum())
-    gain = expected**0.5 - float(samples.mean(0).norm())
-    assert float(session.expected_gain) == pytest.approx(gain, abs=1e-5)
+    before, after = (
+        (square - (1 - square) / (len(samples) - 1)) / square**0.5
+        for square in (length**2, expected)
+    )
+    assert float(session.expected_gain) == pytest.approx(after - before, abs=1e-5)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 import re
 import sys
@@ -86,14 +87,14 @@ def check_type(name: str, value: Any, kind: type, example: str) -> None:
         )
 
 
-def check_seed(name: str, value: Any) -> int:
-    """Return ``value`` if it is a whole number from 0 to 2³¹ - 1.
+def check_seed(name: str, value: Any, bits: int = 31) -> int:
+    """Return ``value`` if it is a whole number from 0 to 2³¹ - 1, or of so many bits.
 
     Raises:
         InputError: it is not.
     """
-    if check_count(name, value, 0) >= 2**31:
-        raise InputError(f"{name}={value}: expected a whole number below 2147483648")
+    if check_count(name, value, 0) >= 2**bits:
+        raise InputError(f"{name}={value}: expected a whole number below {2**bits}")
     return int(value)
 
 
@@ -175,8 +176,11 @@ def check_choice(name: str, value: Any, choices: tuple[str, ...]) -> str:
         InputError: it is not.
     """
     if value not in choices:
-        options = " or ".join(f"{name}={choice}" for choice in choices)
-        raise InputError(f"{name}={value!r}: expected one of {', '.join(choices)}; set {options}")
+        close = difflib.get_close_matches(str(value), choices, 1)
+        some = close or choices[: 1 if len(choices) > 3 else None]
+        options = " or ".join(f"{name}={choice}" for choice in some)
+        mend = f"did you mean {options}?" if close else f"set {options}"
+        raise InputError(f"{name}={value!r}: expected one of {', '.join(choices)}; {mend}")
     return str(value)
 
 

@@ -6,7 +6,6 @@ answers so far.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -93,7 +92,8 @@ class Learned:
     def expected_alignment(self) -> Tensor:
         """(B n+1), how well the belief expects to be aligned with the person, from 0 to 1: before
         the first answer, and after each."""
-        return self._plain(expected_alignment([state["mean"] for state in self._states]))
+        squares = torch.stack([state["mean"].square().sum(-1) for state in self._states], 1)
+        return self._plain(expected_alignment(squares, self._states[-1]["samples"].shape[1]))
 
     @property
     def likelihoods(self) -> Tensor:
@@ -143,23 +143,34 @@ def summary(samples: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 def scores(samples: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
     """Mean and standard deviation (… n) of the reward of features (n D) over directions (… M D)."""
-    rewards = samples @ features.mT
-    return rewards.mean(-2), rewards.std(-2)
+    rewards = samples.double() @ features.double().mT  # whose squares float32 may not hold
+    return rewards.mean(-2).to(samples), rewards.std(-2).to(samples)
 
 
-def expected_alignment(means: Sequence[Tensor]) -> Tensor:
-    """(B n), how well beliefs with n mean directions (B D) expect to be aligned with the person.
+def expected_alignment(squares: Tensor, n_samples: int) -> Tensor:
+    """How well beliefs expect the direction of their mean to be aligned with the person.
 
-    The mean cosine between the samples and the direction of their mean is the length of the mean.
+    The person's ω is as any sample, but none of those that made the mean: the mean cosine between
+    the mean's direction and *another* sample. Of M samples, each of length 1, the mean of length m
+    has it at (m² - 1/M) / (m (1 - 1/M)), which is about 0 where nothing is known.
+
+    Args:
+        squares: (…), the squared length m² of the mean of the samples' directions.
+        n_samples: M.
+
+    Returns:
+        (…), from 0 to 1.
     """
-    return torch.linalg.vector_norm(torch.stack([*means], 1), dim=-1)
+    others = (n_samples * squares - 1) / (n_samples - 1)
+    return (others / squares.sqrt().clamp(min=1e-12)).clamp(0, 1)
 
 
 def expected_gain(samples: Tensor, options: Tensor, response_model: ResponseModel) -> Tensor:
     """(B), what the answer to a question is expected to add to the expected alignment, at most.
 
-    The gain is of the square (:func:`acquisition.functions.alignment_gain`); by Jensen's inequality
-    the root of the expected square is never less than the expected length.
+    The gain is of the squared length of the mean (:func:`acquisition.functions.alignment_gain`),
+    and the expected alignment is concave in that: by Jensen's inequality what belongs to the
+    expected square is never less than what is expected.
 
     Args:
         samples: (B M D), the belief.
@@ -167,8 +178,8 @@ def expected_gain(samples: Tensor, options: Tensor, response_model: ResponseMode
         response_model: how the belief thinks that people answer.
     """
     gain = score_queries(samples, options.unsqueeze(1), response_model, alignment_gain).squeeze(-1)
-    before = torch.linalg.vector_norm(directions(samples).mean(1), dim=-1)
-    return (before.square() + gain).sqrt() - before
+    before, n_samples = directions(samples).mean(1).square().sum(-1), samples.shape[1]
+    return expected_alignment(before + gain, n_samples) - expected_alignment(before, n_samples)
 
 
 def likelihoods(

@@ -249,10 +249,14 @@ class Normalizer:
         names = names or default_names(len(std))
         low, high = flat.aminmax(dim=0)
         for bad, what, mend in (
-            (low == high, "never varies over the training pool", "drop it, or use a larger pool"),
+            (
+                low == high,
+                "never varies over the pool",
+                "drop it (of a file: task.columns=[…] with the others), or use a larger pool",
+            ),
             (
                 std <= 1e-6 * mean.abs(),
-                "varies by less than a millionth of its mean over the training pool, which float32 "
+                "varies by less than a millionth of its mean over the pool, which float32 "
                 "hardly tells",
                 "subtract a constant where the feature is made, in float64, or drop it",
             ),

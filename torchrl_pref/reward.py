@@ -132,7 +132,6 @@ class Reward(Transform):
             InputError: the features are not (… D) finite numbers.
         """
         self._check(features)
-        check_finite("features", features)
         mean, deviation = scores(
             self.samples, self._normalised(features.reshape(-1, features.shape[-1]))
         )
@@ -142,7 +141,7 @@ class Reward(Transform):
         return (features.to(self.mean) - self.mean) / self.std
 
     def _check(self, features: Any) -> None:
-        """Refuse what is no features."""
+        """Refuse what is no features, or not finite."""
         n_features = len(self.mean)
         if not isinstance(features, Tensor) or features.shape[-1:] != (n_features,):
             what = tuple(features.shape) if isinstance(features, Tensor) else type(features)
@@ -150,6 +149,7 @@ class Reward(Transform):
                 f"features of {what}: expected a tensor (…, {n_features}) of "
                 f"{', '.join(self.feature_names)}"
             )
+        check_finite("features", features)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the reward of recorded steps, as those of a replay buffer."""

@@ -16,6 +16,12 @@ LOCK = ".lock"
 CHECKPOINT = "checkpoint.pt"
 """The file of a run's folder that holds its policy."""
 
+TABLES = "tables.txt"
+"""The file of an evaluation's folder that holds what it found."""
+
+STUDY = "study.db"
+"""The file of a study's folder that holds what people answered."""
+
 
 @contextmanager
 def claimed(folder: Path) -> Iterator[None]:

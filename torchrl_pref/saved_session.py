@@ -72,3 +72,8 @@ def check_content(content: Any) -> None:
         )
     if len(content["queries"]) != len(content["answers"]):
         raise InputError("a session with a query too many or an answer: expected as many of each")
+    if len(content["queries"]) + (content["asked"] is not None) > content["budget"]:
+        raise InputError(
+            f"a session with more questions than budget={content['budget']}: expected at most as "
+            "many, the one that is asked among them"
+        )

@@ -163,7 +163,10 @@ class Session(Learned):
             self._asked, self._n_offered = asked, self._n_gone if offered is None else offered
         index, shown_to = self._asked, self.pool.trajectories
         trajectories = None if shown_to is None else self._plain(shown_to[index])
-        return Asked(self._plain(index), self._plain(self.pool.features[index]), trajectories)
+        # A copy: what a page makes of the index is none of the session's.
+        return Asked(
+            self._plain(index.clone()), self._plain(self.pool.features[index]), trajectories
+        )
 
     @property
     def expected_gain(self) -> Tensor:

@@ -108,7 +108,7 @@ def show_table(sweep: Path, rows: Sequence[Row]) -> None:
 
     widths = [60 if name == "failed" else None for name in rows[0]] if rows else None
     table = tabulate(rows, headers="keys", maxcolwidths=widths)
-    print(f"\nsweep so far, {sweep / TABLE}\n{table}")
+    print(f"\nsweep, {sweep / TABLE}\n{table}")
 
 
 def _row(sweep: Path, folder: Path) -> Row:

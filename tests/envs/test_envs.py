@@ -204,7 +204,7 @@ def test_without_repeats_every_question_is_new(pool: QueryPool) -> None:
     env = make(QueryEnv, small, repeats=False)
     asked = env.rollout(5, coin(env))["next", "session", "history", "index"][:, -1]
     assert all(len(row.unique()) == 5 for row in asked)
-    with pytest.raises(InputError, match=r"setup\.repeats=false with 4 candidates"):
+    with pytest.raises(InputError, match=r"4 candidates and budget=.* without repeats"):
         make(QueryEnv, small, repeats=False, candidates=4)
 
 

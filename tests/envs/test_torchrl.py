@@ -289,8 +289,28 @@ def test_a_replay_buffer_holds_the_pool_once(options: dict[str, Any], pool: Quer
     sampled = buffer.sample()
     assert sampled["queries"].shape == (20, *data["queries"].shape[1:])
     whole = make(QueryEnv, QueryPool(torch.rand(1000, 2, 4)), budget=20)
-    frame = transform.inv(whole.rollout(1, RandomQuery())[:1, 0])
+    frame = PoolOnce(whole).inv(whole.rollout(1, RandomQuery())[:1, 0])
     assert sum(value.nbytes for value in frame.values(True, True)) < 6500
+
+
+def test_pool_once_refuses_what_it_could_not_put_back(pool: QueryPool) -> None:
+    with pytest.raises(InputError, match="PoolOnce of a feed"):
+        PoolOnce(make(FeedEnv, pool))
+    env = TransformedEnv(make(QueryEnv, pool), ObservationNorm(1.0, 2.0, in_keys=["queries"]))
+    with pytest.raises(InputError, match="a transform rewrote them"):
+        PoolOnce(env).inv(env.rollout(2, RandomQuery()))
+
+
+def test_a_step_without_the_session_says_so(pool: QueryPool) -> None:
+    env = make(QueryEnv, pool)
+    with pytest.raises(InputError, match="without the key session"):
+        env.step(RandomQuery()(env.reset()).exclude("session"))
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, "a", 2**70])
+def test_a_seed_that_is_none_is_refused(seed: Any, pool: QueryPool) -> None:
+    with pytest.raises(InputError, match="seed="):
+        make(QueryEnv, pool).set_seed(seed)
 
 
 # Workers

@@ -6,6 +6,7 @@ import math
 from itertools import pairwise
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import pytest
 import torch
 from conftest import RESPONSE_MODELS
@@ -14,7 +15,7 @@ from torch import Tensor
 
 from torchrl_pref.envs.query import QueryEnv
 from torchrl_pref.errors import InputError
-from torchrl_pref.evaluation.figures import figure_1
+from torchrl_pref.evaluation.figures import caption, figure_1
 from torchrl_pref.evaluation.records import (
     COLUMNS,
     CSV,
@@ -48,6 +49,17 @@ def test_stretches_cover_every_update_once(edges_of: object, count: int) -> None
 def test_smoothing_skips_what_is_not_known() -> None:
     values = [math.nan, 1.0, 3.0, math.nan, math.nan, 8.0]
     assert smoothed(values, [1, 4, 6, 7]) == ([2.0, 6.0], [2.0, 8.0])
+
+
+def test_a_caption_has_room_in_its_figure() -> None:
+    for width in (5.6, 10.2):
+        figure = plt.figure(figsize=(width, 3))
+        caption(figure, "how likely people give the answers that beliefs held so likely " * 4)
+        (text,) = figure.texts
+        extent = text.get_window_extent(figure.canvas.get_renderer())  # type: ignore[attr-defined]
+        assert extent.x0 >= 0
+        assert extent.x1 <= figure.bbox.width
+        plt.close(figure)
 
 
 def test_milestones_keep_their_proportion() -> None:

@@ -276,7 +276,7 @@ BAD: dict[str, tuple[str, Callable[[], bytes | str], str]] = {
     "npz: names too few": (
         ".npz",
         lambda: npz(features=X, feature_names=np.array(NAMES[:2])),
-        "other length",
+        "feature_names: . for . features",
     ),
     "npz: one name twice": (
         ".npz",
@@ -347,7 +347,7 @@ BAD: dict[str, tuple[str, Callable[[], bytes | str], str]] = {
             },
             bytes(32),
         ),
-        "other length",
+        "feature_names: . for . features",
     ),
     "parquet: cut off": (".parquet", lambda: parquet_bytes(table())[:-30], "cannot be read"),
     "parquet: cut in half and ended": (

@@ -15,6 +15,7 @@ from PIL import Image
 from starlette.testclient import TestClient
 from study_helpers import client_of, study_of
 
+from torchrl_pref.errors import InputError
 from torchrl_pref.study.log import LogError
 from torchrl_pref.study.serve import Address, listening_at, read_address, serve, write_address
 from torchrl_pref.study.study import Study
@@ -352,6 +353,20 @@ def test_pictures_have_the_same_name_after_a_restart(tmp_path: Path) -> None:
             assert content.startswith(b"\x89PNG")
             assert found.setdefault(url, content) == content
         study.close()
+
+
+def test_an_image_that_cannot_be_seen_is_refused_before_anybody_is_asked(tmp_path: Path) -> None:
+    rows = ["image,size,age"]
+    for number in range(8):
+        Image.new("RGB", (40, 30), (20 * number, 0, 0)).save(tmp_path / f"{number}.png")
+        rows.append(f"{number}.png,{number},{number % 3}")
+    (tmp_path / "t.csv").write_text("\n".join(rows))
+    spoiled = tmp_path / "5.png"
+    spoiled.write_bytes(spoiled.read_bytes()[:60])
+    typed = "task=files", f"task.path={tmp_path / 't.csv'}", "task.images=image", "pool.size=20"
+    (tmp_path / "study").mkdir()
+    with pytest.raises(InputError, match=r"5\.png: cannot be shown"):
+        study_of(tmp_path / "study", *typed)
 
 
 def test_a_study_is_found_at_the_same_link_when_it_goes_on(tmp_path: Path) -> None:

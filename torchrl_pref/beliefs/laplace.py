@@ -26,7 +26,7 @@ from torch.nn import functional as F
 
 from torchrl_pref.beliefs.base import BeliefBase, Update
 from torchrl_pref.beliefs.sampled import uniform_sphere
-from torchrl_pref.config.memory import LAPLACE_HELD, laplace_numbers
+from torchrl_pref.config.memory import LAPLACE_HELD, LEAST_SAMPLES, laplace_numbers
 from torchrl_pref.errors import InputError, check_count, check_type
 from torchrl_pref.questions.base import Evidence
 from torchrl_pref.questions.response_model import ResponseModel
@@ -51,7 +51,7 @@ class LaplaceBelief(BeliefBase):
 
     Args:
         response_model: how the belief thinks that people answer.
-        samples: M, at least 2.
+        samples: M, at least 8.
 
     Raises:
         InputError: the response model is not ``Boltzmann``, or ``samples`` is too small.
@@ -65,7 +65,7 @@ class LaplaceBelief(BeliefBase):
                 "known; expected Boltzmann (tau=noisy or a number), or belief=sampled"
             )
         self.response_model: Boltzmann = response_model
-        self.n_samples = check_count("belief.samples", samples, 2)
+        self.n_samples = check_count("belief.samples", samples, LEAST_SAMPLES)
 
     def prior(self, n_sessions: int, n_features: int, generator: Generator) -> Tensor:
         """Samples of the uniform prior, (S M D)."""

@@ -27,7 +27,7 @@ from torchrl_pref.beliefs.resampling import (
     resample,
 )
 from torchrl_pref.beliefs.slice import Target, round_of_moves
-from torchrl_pref.config.memory import default_moves
+from torchrl_pref.config.memory import LEAST_SAMPLES, default_moves
 from torchrl_pref.errors import check_count, check_type
 from torchrl_pref.questions.base import Evidence
 from torchrl_pref.questions.response_model import ResponseModel
@@ -52,6 +52,9 @@ RESTART_SHARE, RESTART_STAGES = 0.5, 500
 """What each stage of a new beginning keeps, and how many stages there may be: it must find every
 mode, and how much each holds."""
 
+CIRCLE_SHARE = 0.8
+"""What it keeps on a circle, where larger steps give the heaviest of several modes too little."""
+
 FORGOTTEN = 0.95
 """Moves are repeated until the effective sample size is this share of the samples, at most
 ``MAX_ROUNDS`` times."""
@@ -73,7 +76,7 @@ class Belief(BeliefBase):
 
     Args:
         response_model: how the belief thinks the human answers. It may differ from how they do.
-        samples: M, at least 2. With fewer than 20 each sample has too much of a say in where the
+        samples: M, at least 8. With fewer than 20 each sample has too much of a say in where the
             others move, and the spread comes out up to 3% too small.
         moves: Markov moves after each resampling, at least 1; None: as many as there are features
             (D²/8 beyond 8, D³/128 beyond 16), and at least 4. They are repeated where the samples
@@ -88,7 +91,7 @@ class Belief(BeliefBase):
     ) -> None:
         check_type("response_model", response_model, ResponseModel, "Boltzmann(2.0)")
         self.response_model = response_model
-        self.n_samples = check_count("belief.samples", samples, 2)
+        self.n_samples = check_count("belief.samples", samples, LEAST_SAMPLES)
         self.n_moves = None if moves is None else check_count("belief.moves", moves, 1)
 
     def prior(self, n_sessions: int, n_features: int, generator: Generator) -> Tensor:
@@ -242,13 +245,14 @@ class Belief(BeliefBase):
         model = self.response_model
         samples = self.prior(len(samples), samples.shape[2], generator).to(samples)
         inflation, power = torch.ones_like(inflation), torch.zeros_like(inflation)
+        share = CIRCLE_SHARE if samples.shape[2] == CIRCLE else RESTART_SHARE
         todo = torch.arange(len(samples), device=samples.device)
         for stage in range(RESTART_STAGES):
             if todo.numel() == 0:
                 break
             tempered = self._tempered(samples[todo], answers[todo])
             now = power[todo]
-            next_power = self._next_power(tempered, now)
+            next_power = self._next_power(tempered, now, share)
             if stage == RESTART_STAGES - 1:
                 next_power = torch.ones_like(now)
             power[todo] = next_power
@@ -259,15 +263,17 @@ class Belief(BeliefBase):
             todo = todo[next_power < 1]
         return samples, inflation, torch.ones_like(power, dtype=torch.bool)
 
-    def _next_power(self, tempered: Callable[[Tensor, Tensor], Tensor], power: Tensor) -> Tensor:
-        """(S), the largest power of the likelihood that keeps enough samples effective."""
+    def _next_power(
+        self, tempered: Callable[[Tensor, Tensor], Tensor], power: Tensor, share: float
+    ) -> Tensor:
+        """(S), the largest power of the likelihood that keeps a share of the samples effective."""
         likelihood = tempered(torch.zeros_like(power), torch.ones_like(power))
         # By this much no weight becomes more than twice another.
         spread = (likelihood.amax(1) - likelihood.amin(1)).clamp(min=1e-20)
         return furthest(
             (power + math.log(2) / spread).clamp(max=1),
             torch.ones_like(power),
-            lambda to: kish_share(tempered(power, to)) >= RESTART_SHARE,
+            lambda to: kish_share(tempered(power, to)) >= share,
         )
 
     def _foreseen(self, samples: Tensor, answers: Evidence) -> Tensor:

@@ -184,6 +184,11 @@ def _shown(settings: Settings, n_queries: int, n_options: int, n_features: int) 
     return min(n_queries, candidates or n_queries) * each
 
 
+LEAST_SAMPLES = 8
+"""M of a belief: fewer are too few to tell each other where to move, and the entropy of four or
+less is not told."""
+
+
 def default_moves(n_features: int) -> int:
     """V of a belief whose ``moves`` is None.
 

@@ -31,7 +31,7 @@ from torchrl_pref.config.checks import (
     optional,
     positive,
 )
-from torchrl_pref.config.memory import check_memory
+from torchrl_pref.config.memory import LEAST_SAMPLES, check_memory
 from torchrl_pref.config.sections import Plain, Settings
 from torchrl_pref.config.together import (
     check_drawn,
@@ -147,7 +147,10 @@ ALGORITHMS: dict[str, dict[str, Check]] = {
         "algorithm.minibatches": count(1),
     },
 }
-SAMPLED: dict[str, Check] = {"belief.samples": count(2), "belief.moves": optional(count(1))}
+SAMPLED: dict[str, Check] = {
+    "belief.samples": count(LEAST_SAMPLES),
+    "belief.moves": optional(count(1)),
+}
 OTHERS: dict[str, dict[str, dict[str, Check]]] = {
     "task": {
         "gridworld": {
@@ -160,7 +163,7 @@ OTHERS: dict[str, dict[str, dict[str, Check]]] = {
     "belief": {
         "sampled": SAMPLED,
         "rationality": {**SAMPLED, "belief.spread": check_spread},
-        "laplace": {"belief.samples": count(2)},
+        "laplace": {"belief.samples": count(LEAST_SAMPLES)},
     },
 }
 """Of the other groups. What is not in here is checked by what is made of it: ``open_groups``."""

@@ -24,7 +24,7 @@ def check_together(settings: Plain) -> None:
     Raises:
         InputError: some are.
     """
-    pool, setup, belief = settings["pool"], settings["setup"], settings["belief"]
+    pool, setup = settings["pool"], settings["setup"]
     _check_demonstrations(settings)
     check_belief(settings)
     given = [name for name in ("train", "test") if pool[name] is not None]
@@ -46,11 +46,6 @@ def check_together(settings: Plain) -> None:
                 f"setup.repeats=false with {shown} candidates and setup.budget={budget}: expected "
                 "at least as many candidates as asks; raise one or lower the other"
             )
-    if settings["objective"] == "entropy" and belief.get("samples", 4) < 4:
-        raise InputError(
-            f"objective=entropy with belief.samples={belief['samples']}: expected at least 4, as "
-            "the entropy is told by the third nearest sample; raise belief.samples"
-        )
 
 
 def _check_batches(settings: Plain) -> None:

@@ -79,8 +79,9 @@ class InformationGain(Objective):
 class Alignment(Objective):
     """The length of the mean belief squared: the alignment that the belief itself expects.
 
-    E‖ω̄‖² over the humans that a belief describes is their mean alignment, so this has
-    its expectation without the noise of the one hidden ω.
+    E‖ω̄‖² over the humans that a belief describes is their mean alignment, so this has its
+    expectation without the noise of the one hidden ω; but for the luck of M samples, which adds
+    (1 - ‖E ω‖²) / M.
     """
 
     acquisition = staticmethod(alignment_gain)

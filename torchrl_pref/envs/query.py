@@ -84,8 +84,8 @@ class QueryEnv(SessionEnv):
             )
         if not repeats and self.n_candidates < budget:
             raise InputError(
-                f"setup.repeats=false with {self.n_candidates} candidates and setup.budget={budget}"
-                ": expected at least as many candidates as asks; raise one or lower the other"
+                f"{self.n_candidates} candidates and budget={budget} without repeats: expected at "
+                "least as many candidates as asks; raise one, lower the other, or let them repeat"
             )
         self.repeats = check_flag("setup.repeats", repeats)
         self._table = Table(batch=self.batch)

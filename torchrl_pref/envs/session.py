@@ -58,7 +58,7 @@ from torchrl_pref.envs.transition import (
     rows,
     tell,
 )
-from torchrl_pref.errors import InputError, check_count, check_type
+from torchrl_pref.errors import InputError, check_count, check_seed, check_type
 from torchrl_pref.humans.base import HumanBase
 from torchrl_pref.humans.demonstrations import Demonstrations
 from torchrl_pref.pool import QueryPool
@@ -100,8 +100,6 @@ class SessionEnv(EnvBase):
         check_type("human", human, HumanBase, "SimulatedHuman(Boltzmann(2.0))")
         check_type("belief", belief, BeliefBase, "Belief(Boltzmann(2.0))")
         check_same(human.response_model.question, belief.response_model.question)
-        if seed is not None:
-            check_count("seed", seed, 0)
         super().__init__(device=device, batch_size=torch.Size(batch_size))
         self.register_buffer("features", pool.features.to(device))
         if seen is not None:
@@ -150,8 +148,11 @@ class SessionEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         """Without a seed humans are new ones each time, in whatever process."""
+        if seed is None:
+            chosen = int.from_bytes(os.urandom(6), "big")
+        else:
+            chosen = check_seed("seed", seed, bits=63)
         self._seed, self._home = seed, (os.getpid(), id(self))
-        chosen = int.from_bytes(os.urandom(6), "big") if seed is None else seed
         self._generator = Generator(self.device).manual_seed(chosen)
 
     @property
@@ -243,6 +244,11 @@ class SessionEnv(EnvBase):
 
     def _session_of(self, tensordict: TensorDictBase) -> tuple[Tree, SessionState]:
         """What is hidden and what is kept of the sessions in a tensordict."""
+        if "session" not in tensordict.keys():  # noqa: SIM118, a tensordict is no dictionary
+            raise InputError(
+                "a step without the key session, in which a session's own state is: expected it "
+                "beside the action; let no transform exclude it, nor a SelectTransform leave it out"
+            )
         session = {**tensordict["session"]}
         session["history"] = {**session["history"]}
         return self._hidden_of(tensordict), cast(SessionState, session)

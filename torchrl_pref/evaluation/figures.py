@@ -47,6 +47,9 @@ from matplotlib.ticker import MaxNLocator
 TITLE = 46
 """Letters of a panel's title in a line."""
 
+LETTERS = 16
+"""Of a caption in an inch."""
+
 
 def figure_1(records: Records, path: Path, metric: str = "alignment") -> None:
     """The paper's Figure 1: alignment, or another metric, against the number of queries, a panel
@@ -173,8 +176,9 @@ def _finish(axis: Axes) -> None:
 
 
 def caption(figure: Figure, text: str) -> None:
-    """What a figure shows, in small letters below it."""
-    figure.supxlabel(text, fontsize="small", color="#555555")
+    """What a figure shows, in small letters below it, in lines that it has room for."""
+    lines = fill(text, int(LETTERS * figure.get_figwidth()))
+    figure.supxlabel(lines, fontsize="small", color="#555555")
 
 
 def save_figure(figure: Figure, path: Path) -> None:

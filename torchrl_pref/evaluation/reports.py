@@ -9,6 +9,7 @@ from torchrl_pref.evaluation.metrics import ALWAYS, METRICS
 from torchrl_pref.evaluation.records import Records, write_records
 from torchrl_pref.evaluation.tables import tables
 from torchrl_pref.evaluation.views import write_curves
+from torchrl_pref.runs import TABLES
 from torchrl_pref.storage.writing import write_text
 
 
@@ -16,7 +17,7 @@ def write_report(folder: Path, records: Records) -> None:
     """Write all there is to an existing folder; print the tables and say where."""
     heldout = records.entries[0].protocol == "heldout"
     text, picture = tables(records), "heldout.png" if heldout else "figure_1.png"
-    write_text(folder / "tables.txt", text)
+    write_text(folder / TABLES, text)
     write_curves(folder / "curves.csv", records)
     (heldout_figure if heldout else figure_1)(records, folder / picture)
     pictures = [picture]
@@ -26,5 +27,5 @@ def write_report(folder: Path, records: Records) -> None:
     if "calibration" in records.metrics:
         reliability_figure(records, folder / "reliability.png")
         pictures.append("reliability.png")
-    written = ["tables.txt", "curves.csv", *pictures, *write_records(folder, records)]
+    written = [TABLES, "curves.csv", *pictures, *write_records(folder, records)]
     print(f"\n{text}\nwritten to {folder}: {', '.join(written)}")

@@ -17,7 +17,7 @@ from torch import Tensor
 from torchrl_pref.evaluation.metrics import BINS, PARTS
 from torchrl_pref.evaluation.records import RELIABILITY, Records
 from torchrl_pref.evaluation.statistics import bootstrap_interval
-from torchrl_pref.evaluation.style import baseline_of, is_feed, is_judged
+from torchrl_pref.evaluation.style import baseline_of, is_feed, is_judged, name_of
 from torchrl_pref.storage.writing import replacing
 
 FEWEST = 100
@@ -101,7 +101,8 @@ def answers_to_reach(records: Records, key: str, level: float) -> str:
 
 
 def write_curves(path: Path, records: Records) -> None:
-    """Write every curve as CSV: task, strategy, query, metric, mean and 95% interval."""
+    """Write every curve as CSV: task, strategy as tables name it, query, metric, mean and 95%
+    interval."""
     with replacing(path) as partial, partial.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["task", "strategy", "query", "metric", "mean", "low", "high"])
@@ -115,4 +116,4 @@ def write_curves(path: Path, records: Records) -> None:
                     for place, column in enumerate(values.unbind(-1)):
                         found = mean_and_interval(column)
                         numbers = ("" if math.isnan(one) else f"{one:.5f}" for one in found)
-                        writer.writerow([task, key, place * own.batch, metric, *numbers])
+                        writer.writerow([task, name_of(key), place * own.batch, metric, *numbers])

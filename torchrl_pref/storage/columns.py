@@ -124,7 +124,8 @@ def of_arrays(
         )
     names = default_names(features.shape[-1]) if labels is None else labels
     if not isinstance(names, (list, tuple)) or len(names) != features.shape[-1]:
-        raise Refused(f"{NAMES} of other length than the {features.shape[-1]} features")
+        count = len(names) if isinstance(names, (list, tuple)) else "no list"
+        raise Refused(f"{NAMES}: {count} for {features.shape[-1]} features; expected one of each")
     names = [str(name) for name in names]
     beside = [name for name in there if name == choice.texts]
     chosen = choice.pick([*names, *beside])

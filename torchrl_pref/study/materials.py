@@ -6,7 +6,10 @@ Shapes: N queries, K options per query, D features.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 from typing import cast
+
+from tqdm import tqdm
 
 from torchrl_pref.acquisition.per_second import Cost
 from torchrl_pref.beliefs.base import BeliefBase
@@ -21,7 +24,8 @@ from torchrl_pref.questions.responses import model_of
 from torchrl_pref.session import Session
 from torchrl_pref.strategies import MakeStrategy, make_strategy
 from torchrl_pref.tasks.base import Task, feature_bars, make_pool
-from torchrl_pref.tasks.scene import Scene
+from torchrl_pref.tasks.images import Images
+from torchrl_pref.tasks.scene import Picture, Scene
 from torchrl_pref.typed_code import load_typed
 
 
@@ -118,7 +122,7 @@ def make_materials(settings: Plain, raw: QueryPool) -> Materials:
     task = None if settings["pool"]["file"] is not None else make("task", settings["task"])
     made = Materials(settings, raw, pool, normalizer, question, model, _strategy(settings), task)
     if task is not None:
-        _try_scene(made)
+        _try_scenes(made)
     made.session(0)  # or it is refused here
     return made
 
@@ -134,11 +138,11 @@ def _strategy(settings: Plain) -> str | MakeStrategy:
     return lambda env: make_strategy(named, env, "policy", cost=cost)
 
 
-def _try_scene(materials: Materials) -> None:
-    """Refuse a task that cannot draw.
+def _try_scenes(materials: Materials) -> None:
+    """Refuse a task that cannot draw, or a pool with an image that cannot be shown.
 
     Raises:
-        InputError: it cannot.
+        InputError: it cannot, or there is one.
     """
     scene = materials.scene(0, 0)
     if not isinstance(scene, Scene) or not scene.frames:
@@ -146,3 +150,9 @@ def _try_scene(materials: Materials) -> None:
             f"task={materials.settings['task']['name']}: draws nothing of a trajectory; expected a "
             "Scene with at least one frame from its method scene"
         )
+    if any(isinstance(shape, Picture) for shape in scene.shapes):
+        options = product(range(len(materials.raw)), range(materials.raw.n_options))
+        shapes = (shape for option in options for shape in materials.scene(*option).shapes)
+        images, shown = Images(), (shape for shape in shapes if isinstance(shape, Picture))
+        for picture in tqdm(dict.fromkeys(shown), desc="images", delay=1, leave=False):
+            images.at(picture, 0)

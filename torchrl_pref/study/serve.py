@@ -54,7 +54,8 @@ def listening_at(folder: Path, host: str, port: int) -> Iterator[socket.socket]:
     except OSError as error:
         raise InputError(
             f"host={host} port={port}: cannot be served there ({error.strerror or error}); type "
-            "another port, or port=0 for any that is free"
+            "another port, or port=0 for any that is free, and host=127.0.0.1 or another address "
+            "of this machine"
         ) from None
     with listening:
         yield listening

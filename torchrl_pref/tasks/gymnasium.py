@@ -7,6 +7,7 @@ A numbers of an action.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -107,7 +108,9 @@ class VectorSimulator(Simulator):
         from gymnasium.vector import SyncVectorEnv
 
         try:
-            self._envs = SyncVectorEnv([make] * size)
+            # Of an id without its version Gymnasium tells which one it takes: the newest.
+            with warnings.catch_warnings(action="ignore", category=UserWarning):
+                self._envs = SyncVectorEnv([make] * size)
         except Exception as error:  # each kind of environment has its own reasons
             raise InputError(f"the environment cannot be made ({_mended(error)})") from error
         observed, acted = self._envs.single_observation_space, self._envs.single_action_space

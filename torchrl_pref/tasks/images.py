@@ -11,14 +11,13 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from PIL import ExifTags, Image
 
 from torchrl_pref.errors import InputError
-from torchrl_pref.tasks.scene import Picture, Scene, Shape
+from torchrl_pref.tasks.scene import Picture, Scene
 
 
 class Images:
@@ -114,7 +113,7 @@ def frame_count(scene: Scene, images: Images) -> int:
 
 def shaped(scenes: Sequence[Scene], images: Images) -> list[Scene]:
     """The options of a question, of the shape of the highest image where there is nothing else."""
-    shapes: list[Shape] = [shape for scene in scenes for shape in chain(scene.still, *scene.frames)]
+    shapes = [shape for scene in scenes for shape in scene.shapes]
     pictures = [shape for shape in shapes if isinstance(shape, Picture)]
     if not pictures or len(pictures) < len(shapes):
         return list(scenes)

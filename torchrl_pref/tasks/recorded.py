@@ -77,7 +77,8 @@ class RecordedTask(Task):
         elif given > 1 and given != n_options:
             raise InputError(
                 f"pool.options={n_options}: {self._source} holds queries of {given} options; set "
-                f"pool.options={given}"
+                f"pool.options={given}, or, where these are the steps of a trajectory, give one "
+                "row of features for each trajectory, such as their means"
             )
         else:
             raise InputError(

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import TypeAlias
 
 Point: TypeAlias = tuple[float, float]
@@ -78,6 +79,11 @@ class Scene:
     still: tuple[Shape, ...]
     frames: tuple[tuple[Shape, ...], ...]
     equal: bool = True
+
+    @property
+    def shapes(self) -> tuple[Shape, ...]:
+        """All that is seen, whenever."""
+        return (*self.still, *chain(*self.frames))
 
 
 def corners(scenes: Sequence[Scene]) -> tuple[Point, Point]:

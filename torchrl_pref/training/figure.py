@@ -111,9 +111,9 @@ def training_figure(training: Training, path: Path) -> None:
         caption(
             figure,
             f"above: alignment after the last query, mean of {count} humans that no training met, "
-            "on the held-out pool with as many candidates\nor offers as in training, the same "
+            "on the held-out pool with as many candidates or offers as in training, the same "
             "humans with the same luck each time; band and bars are 95% intervals; "
-            "below: means over\nthe episodes of the training",
+            "below: means over the episodes of the training",
         )
     for key in below:
         points = smoothed(history[key], even_edges(len(history[key])))
@@ -199,7 +199,7 @@ def figure_2(trained: Sequence[Training], path: Path) -> None:
     _legend_above(axis)
     caption(
         figure,
-        "mean of the episodes that ended in an update: of those that begin together short ones\n"
+        "mean of the episodes that ended in an update: of those that begin together short ones "
         "end first, so that the curve may rise until every session has ended once",
     )
     save_figure(figure, path)

@@ -93,9 +93,9 @@ def _welcome(study: Study) -> bool:
     print()
     instruct(study)
     say(
-        f"There are at most {study.materials.n_questions} questions about what you like. There is "
-        "no right answer. Every answer is saved at once; you can take any of them back, and stop "
-        "whenever you like. Type a line, then Enter; h lists what you can type."
+        f"Of questions about what you like there are at most {study.materials.n_questions}. "
+        "There is no right answer. Every answer is saved at once; you can take any of them back, "
+        "and stop whenever you like. Type a line, then Enter; h lists what you can type."
     )
     while settings["consent"]:
         said = input("Have you read this, and do you agree to take part? (y or n) ")

@@ -240,7 +240,7 @@ class Conversation:
     def _end(self, state: dict[str, Any]) -> None:
         """What is shown once there is no question left."""
         self._key = None
-        rule(f"{state['answered']} answers")
+        rule(f"Answers: {state['answered']}")
         say(ENDS[state["end"]["reason"]])
         self._show_learned(state)
         say(f"{hint([], BESIDE)} · Enter ends")

@@ -69,6 +69,14 @@ def benchmark(
     return Part(page, (command,), minutes, docs_tables.measured(choose))
 
 
+def in_corners(setup: str, corners: str) -> Part:
+    """The policies for every task where there is room, on twice as many pools."""
+    weights = " ".join(f"torchrl_pref/policies/weights/{setup}-every-{k}.pt" for k in range(SEEDS))
+    name = "room_policies" if setup == "query" else "room_feed_policies"
+    more = f'--setup {setup} --pools 16 --only "{corners}" --policies {weights}'
+    return benchmark(name, "docs/strategies.md", 5, more, "room")
+
+
 def on_task(task: str) -> Iterator[str]:
     """Two trainings on a task, and the held-out protocol there, with the Gridworld's policies."""
     runs = [f"{{folder}}/{task}-{tau}" for tau in TAUS]
@@ -255,6 +263,8 @@ PARTS: dict[str, Part] = {
         "room_finer", "docs/strategies.md", 8, '--pools 16 --only "D=8;tau unknown"', "room"
     ),
     "room_feed": benchmark("room_feed", "docs/strategies.md", 40, "--setup feed", "room"),
+    "room_policies": in_corners("query", "D=8;K=5;tau unknown"),
+    "room_feed_policies": in_corners("feed", "H=20;D=16;70%, H=20;N=50;isotropic, H=20"),
     "room_kinds": benchmark("room_kinds", "docs/strategies.md", 35, "--humans 60"),
     **{f"{of}_cost": benchmark(f"{of}_cost", page, 0.5, of, "costs") for of, page in COSTS.items()},
     "large_pool": benchmark("large_pool", "docs/speed.md", 3),

@@ -273,11 +273,13 @@ def measure(corner: Corner, setup: str, pools: int, humans: int, policies: Tried
 
 
 def row_of_policies(name: str, found: Found) -> common.Row:
-    """What is told of a corner where policies were tried."""
+    """What is told of a corner where policies were tried: of each, and of their mean."""
     row: common.Row = {"corner": name, "alignment": float(torch.cat(found.curves[BASELINE]).mean())}
-    for each in found.curves:
-        if each != BASELINE:
-            row[each] = "{:+.3f} ± {:.3f}".format(*found.more(each))
+    policies = [each for each in found.curves if each != BASELINE]
+    of_each_pool = zip(*(found.curves[each] for each in policies), strict=True)
+    found.curves["their mean"] = [torch.stack(curves).mean(0) for curves in of_each_pool]
+    for each in (*policies, "their mean"):
+        row[each] = "{:+.3f} ± {:.3f}".format(*found.more(each))
     return row
 
 
@@ -332,7 +334,7 @@ def main() -> None:
     if not typed.policies:
         check_pools(parser, typed.pools)
     corners = {**CORNERS, **OF_FEEDS} if typed.setup == "feed" else CORNERS
-    policies, rows = {str(path): trained(path) for path in typed.policies}, []
+    policies, rows = {path.stem: trained(path) for path in typed.policies}, []
     for name in tqdm(chosen(parser, typed, corners), desc="corners"):
         corner = replace(Corner(), **corners[name])
         found = measure(corner, typed.setup, typed.pools, typed.humans, policies)

@@ -263,7 +263,7 @@ PARTS: dict[str, Part] = {
         "room_finer", "docs/strategies.md", 8, '--pools 16 --only "D=8;tau unknown"', "room"
     ),
     "room_feed": benchmark("room_feed", "docs/strategies.md", 40, "--setup feed", "room"),
-    "room_policies": in_corners("query", "D=8;K=5;tau unknown"),
+    "room_policies": in_corners("query", "D=8;D=16;K=5;N=50"),
     "room_feed_policies": in_corners("feed", "H=20;D=16;70%, H=20;N=50;isotropic, H=20"),
     "room_kinds": benchmark("room_kinds", "docs/strategies.md", 35, "--humans 60"),
     **{f"{of}_cost": benchmark(f"{of}_cost", page, 0.5, of, "costs") for of, page in COSTS.items()},

@@ -326,8 +326,7 @@ def load_policy(checkpoint: Checkpoint | str | Path, env: EnvBase) -> Policy:
             f"an environment of batch size {tuple(env.batch_size)}: expected one size, as a policy "
             "is for the sessions of one environment; make it for one with a larger batch_size"
         )
-    settings = checkpoint.settings
-    setup, _ = setups_of(env)
+    settings, (setup, _) = checkpoint.settings, setups_of(env)
     if settings["setup"]["name"] != setup:
         raise InputError(
             f"a policy of setup={settings['setup']['name']} cannot decide in one of "
@@ -346,6 +345,6 @@ def load_policy(checkpoint: Checkpoint | str | Path, env: EnvBase) -> Policy:
             "squares; normalise the pool, by Normalizer.fit"
         )
     with torch.random.fork_rng(devices=[]):  # the weights it begins with are not kept
-        policy = make_policy(checkpoint.settings, env)
+        policy = make_policy(settings, env)
     load_weights(policy, checkpoint)
     return policy

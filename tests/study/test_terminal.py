@@ -446,7 +446,7 @@ def test_people_read_first_and_agree(
     out = capsys.readouterr().out
     assert "Arms" in out
     assert "ROBOTS\n\nLook at both.\n\n- one\n- two\n" in out
-    assert "at most 6 questions" in out
+    assert "there are at most 6" in out
     assert "── Question" not in out
     types("Yes", "a")
     converse(study, "P1")

@@ -105,7 +105,7 @@ def begin(folder: Path, settings: Plain) -> None:
         )
     if (folder / CONFIG).exists():
         raise InputError(f"{folder} holds a run of train.py; name another folder by hydra.run.dir=")
-    from torchrl_pref.study.materials import draw_pool, make_materials
+    from torchrl_pref.study.materials import check_images, draw_pool, make_materials
 
     with runs.claimed(folder), way_to_ask(folder, settings) as ask:
         app.use_threads(settings)
@@ -116,6 +116,7 @@ def begin(folder: Path, settings: Plain) -> None:
                 f"pool.size={settings['pool']['size']} asks for more"
             )
         materials = make_materials(settings, raw)  # or it is refused, before anything is written
+        check_images(materials)
         raw.save(folder / POOL)
         write_text(folder / CONFIG, OmegaConf.to_yaml(OmegaConf.create(settings)))
         run(make_study(folder, materials), ask)
@@ -128,9 +129,13 @@ def go_on(folder: Path, typed_now: Plain) -> None:
     settings |= {key: typed_now[key] for key in BESIDE_RESUME if typed.was_typed(key)}
     if settings["ui"] == "browser":
         check_installed()
+    from torchrl_pref.study.materials import check_images
+
     with runs.claimed(folder), way_to_ask(folder, settings) as ask:
         app.use_threads(settings)
-        run(load_study(folder, settings), ask)
+        materials = load_materials(folder, settings)
+        check_images(materials)
+        run(make_study(folder, materials), ask)
 
 
 def load_settings(key: str, folder: Path) -> Plain:

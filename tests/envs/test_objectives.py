@@ -148,6 +148,8 @@ def test_entropy_is_told_by_the_distance_to_the_third_nearest(generator: Generat
     samples = 3 * samples  # their lengths are no part of ω
     potential = make_objective("entropy").potential({"samples": samples}, {})  # type: ignore[arg-type]
     assert potential.squeeze(-1).tolist() == pytest.approx(expected, abs=1e-4)
+    with pytest.raises(InputError, match="objective=entropy with 3 samples"):
+        make_objective("entropy").potential({"samples": samples[:, :3]}, {})  # type: ignore[arg-type]
 
 
 def test_unknown_objective_is_refused() -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
+from PIL import Image
 from starlette.testclient import TestClient
 
 from torchrl_pref.config.study import check_ask_settings
@@ -48,6 +49,15 @@ def materials_of(*typed: str) -> Materials:
 def study_of(folder: Path, *typed: str) -> Study:
     """A study of a few questions, or the one that is there."""
     return Study(folder, materials_of(*typed))
+
+
+def write_table(folder: Path) -> None:
+    """Trajectories of one's own: three features, and an image of each."""
+    rows = ["speed,comfort,energy,picture"]
+    for number in range(30):
+        Image.new("RGB", (4, 4), (8 * number, 0, 0)).save(folder / f"{number}.png")
+        rows.append(f"{number % 7},{number % 5},{number % 3},{number}.png")
+    (folder / "runs.csv").write_text("\n".join(rows))
 
 
 def client_of(study: Study, token: str | None = None) -> TestClient:

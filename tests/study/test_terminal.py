@@ -19,7 +19,7 @@ import pytest
 import torch
 from PIL import Image
 from scripts import TIMEOUT, start_in_terminal
-from study_helpers import SMALL, answer_all, careful, materials_of, study_of
+from study_helpers import SMALL, answer_all, careful, materials_of, study_of, write_table
 
 from torchrl_pref.errors import InputError
 from torchrl_pref.study.log import Log, LogError
@@ -88,15 +88,6 @@ def events_of(study: Study) -> list[tuple[str, str, dict[str, Any]]]:
         (one.participant, one.kind, {k: v for k, v in one.content.items() if k != "seconds"})
         for one in study.log.events()
     ]
-
-
-def write_table(folder: Path) -> None:
-    """Trajectories of one's own: three features, and an image of each."""
-    rows = ["speed,comfort,energy,picture"]
-    for number in range(30):
-        Image.new("RGB", (4, 4), (8 * number, 0, 0)).save(folder / f"{number}.png")
-        rows.append(f"{number % 7},{number % 5},{number % 3},{number}.png")
-    (folder / "runs.csv").write_text("\n".join(rows))
 
 
 STUDIES = {

@@ -11,16 +11,19 @@ from typing import Any
 
 import pytest
 import uvicorn
-from PIL import Image
 from starlette.testclient import TestClient
-from study_helpers import client_of, study_of
+from study_helpers import client_of, materials_of, study_of, write_table
 
 from torchrl_pref.errors import InputError
 from torchrl_pref.study.log import LogError
+from torchrl_pref.study.materials import check_images
 from torchrl_pref.study.serve import Address, listening_at, read_address, serve, write_address
 from torchrl_pref.study.study import Study
 
 JSON = {"content-type": "application/json"}
+
+IMAGES = "task=files task.path={}/runs.csv task.images=picture pool.size=20"
+"""A study about what ``write_table`` leaves."""
 
 
 @pytest.fixture
@@ -335,12 +338,8 @@ def test_a_tunnel_or_a_server_with_a_certificate_may_stand_before_it(
 
 
 def test_pictures_have_the_same_name_after_a_restart(tmp_path: Path) -> None:
-    rows = ["image,size,age"]
-    for number in range(8):
-        Image.new("RGB", (4, 3), (20 * number, 0, 0)).save(tmp_path / f"{number}.png")
-        rows.append(f"{number}.png,{number},{number % 3}")
-    (tmp_path / "t.csv").write_text("\n".join(rows))
-    typed = "task=files", f"task.path={tmp_path / 't.csv'}", "task.images=image", "pool.size=20"
+    write_table(tmp_path)
+    typed = IMAGES.format(tmp_path).split()
     (tmp_path / "study").mkdir()
     found: dict[str, bytes] = {}
     for code in ("P1", "P2", "P1"):  # in another order than they were first seen
@@ -356,17 +355,14 @@ def test_pictures_have_the_same_name_after_a_restart(tmp_path: Path) -> None:
 
 
 def test_an_image_that_cannot_be_seen_is_refused_before_anybody_is_asked(tmp_path: Path) -> None:
-    rows = ["image,size,age"]
-    for number in range(8):
-        Image.new("RGB", (40, 30), (20 * number, 0, 0)).save(tmp_path / f"{number}.png")
-        rows.append(f"{number}.png,{number},{number % 3}")
-    (tmp_path / "t.csv").write_text("\n".join(rows))
+    write_table(tmp_path)
+    typed = IMAGES.format(tmp_path).split()
+    check_images(materials_of(*typed))
     spoiled = tmp_path / "5.png"
-    spoiled.write_bytes(spoiled.read_bytes()[:60])
-    typed = "task=files", f"task.path={tmp_path / 't.csv'}", "task.images=image", "pool.size=20"
-    (tmp_path / "study").mkdir()
+    spoiled.write_bytes(spoiled.read_bytes()[:45])
+    materials = materials_of(*typed)  # of a study that is exported they may be spoiled by now
     with pytest.raises(InputError, match=r"5\.png: cannot be shown"):
-        study_of(tmp_path / "study", *typed)
+        check_images(materials)
 
 
 def test_a_study_is_found_at_the_same_link_when_it_goes_on(tmp_path: Path) -> None:

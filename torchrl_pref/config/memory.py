@@ -185,8 +185,7 @@ def _shown(settings: Settings, n_queries: int, n_options: int, n_features: int) 
 
 
 LEAST_SAMPLES = 8
-"""M of a belief: fewer are too few to tell each other where to move, and the entropy of four or
-less is not told."""
+"""M of a belief: fewer are too few to tell each other where to move."""
 
 
 def default_moves(n_features: int) -> int:

@@ -20,7 +20,7 @@ from torch.nn import functional as F
 from torchrl_pref.acquisition.functions import Acquisition, alignment_gain, information_gain
 from torchrl_pref.acquisition.scoring import predict_answers, score_queries
 from torchrl_pref.envs.transition import SessionState
-from torchrl_pref.errors import check_choice
+from torchrl_pref.errors import InputError, check_choice
 from torchrl_pref.questions.response_model import ResponseModel
 from torchrl_pref.tensors import directions
 
@@ -126,6 +126,11 @@ class Entropy(Objective):
     def potential(self, session: SessionState, human: Mapping[str, Any]) -> Tensor:
         """See :meth:`Objective.potential`."""
         samples = directions(session["samples"])
+        if samples.shape[1] < 4:  # of a belief of the user's: the package's have more
+            raise InputError(
+                f"objective=entropy with {samples.shape[1]} samples: expected at least 4, as the "
+                "entropy is told by the third nearest sample; raise belief.samples"
+            )
         nearest = (
             torch.cdist(samples, samples, compute_mode="donot_use_mm_for_euclid_dist")
             .topk(4, largest=False)

@@ -122,7 +122,7 @@ def make_materials(settings: Plain, raw: QueryPool) -> Materials:
     task = None if settings["pool"]["file"] is not None else make("task", settings["task"])
     made = Materials(settings, raw, pool, normalizer, question, model, _strategy(settings), task)
     if task is not None:
-        _try_scenes(made)
+        _try_scene(made)
     made.session(0)  # or it is refused here
     return made
 
@@ -138,11 +138,11 @@ def _strategy(settings: Plain) -> str | MakeStrategy:
     return lambda env: make_strategy(named, env, "policy", cost=cost)
 
 
-def _try_scenes(materials: Materials) -> None:
-    """Refuse a task that cannot draw, or a pool with an image that cannot be shown.
+def _try_scene(materials: Materials) -> None:
+    """Refuse a task that cannot draw.
 
     Raises:
-        InputError: it cannot, or there is one.
+        InputError: it cannot.
     """
     scene = materials.scene(0, 0)
     if not isinstance(scene, Scene) or not scene.frames:
@@ -150,9 +150,18 @@ def _try_scenes(materials: Materials) -> None:
             f"task={materials.settings['task']['name']}: draws nothing of a trajectory; expected a "
             "Scene with at least one frame from its method scene"
         )
-    if any(isinstance(shape, Picture) for shape in scene.shapes):
-        options = product(range(len(materials.raw)), range(materials.raw.n_options))
-        shapes = (shape for option in options for shape in materials.scene(*option).shapes)
-        images, shown = Images(), (shape for shape in shapes if isinstance(shape, Picture))
-        for picture in tqdm(dict.fromkeys(shown), desc="images", delay=1, leave=False):
-            images.at(picture, 0)
+
+
+def check_images(materials: Materials) -> None:
+    """Refuse to ask about an image that cannot be seen.
+
+    Raises:
+        InputError: there is one.
+    """
+    if not any(isinstance(shape, Picture) for shape in materials.scene(0, 0).shapes):
+        return  # as the others of the pool
+    options = product(range(len(materials.raw)), range(materials.raw.n_options))
+    shapes = (shape for option in options for shape in materials.scene(*option).shapes)
+    images, shown = Images(), (shape for shape in shapes if isinstance(shape, Picture))
+    for picture in tqdm(dict.fromkeys(shown), desc="images", delay=1, leave=False):
+        images.at(picture, 0)

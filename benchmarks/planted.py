@@ -294,8 +294,8 @@ FAULTS = (
     Fault(
         "a session that was cut off is taken to be worth nothing more",
         "training/sessions.py",
-        "later[cut, t] = value",
-        "later[cut, t] = 0.0",
+        "later[who, t] = value",
+        "later[who, t] = 0.0",
         f"{TRAINING}::test_a_batch_has_the_values_of_each_state_and_the_next",
     ),
     Fault(

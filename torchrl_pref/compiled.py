@@ -61,7 +61,10 @@ def over_sessions(loop: Callable[..., None], n_sessions: int, *arguments: Any) -
         n_sessions: how many there are.
         arguments: what else the loop takes.
     """
-    parts = max(1, min(_threads, n_sessions // FEWEST))
+    parts = min(_threads, n_sessions // FEWEST)
+    if parts < 2:
+        loop(0, n_sessions, *arguments)
+        return
     ends = [part * n_sessions // parts for part in range(parts + 1)]
     others = [_executor().submit(loop, *ends[p : p + 2], *arguments) for p in range(1, parts)]
     try:

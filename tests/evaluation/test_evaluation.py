@@ -218,5 +218,5 @@ def test_humans_of_the_evaluation_are_not_those_of_the_training() -> None:
     trainer, task = trainer_of(settings)
     n_humans, seed = check_evaluation(settings)
     judged = draw_humans(make_query_env(settings, task, task.test, n_humans, seed))
-    trained = trainer.sessions.now
-    assert not torch.isclose(judged["human", "omega"], trained["human", "omega"]).any()
+    trained = trainer.sessions.hidden["human"]["omega"]
+    assert not torch.isclose(judged["human", "omega"], trained).any()

@@ -91,7 +91,7 @@ def test_each_part_has_its_own_humans_and_luck() -> None:
     sessions = trainer.sessions
     assert isinstance(sessions, SessionParts)
     (part,) = sessions.others
-    omegas = [of.now["human", "omega"] for of in (sessions.first, part.sessions)]
+    omegas = [of.hidden["human"]["omega"] for of in (sessions.first, part.sessions)]
     assert not (omegas[0].unsqueeze(1) == omegas[1]).all(-1).any()
     before = torch.get_rng_state()
     luck = part.luck

@@ -11,6 +11,7 @@ import pytest
 import torch
 from helpers import LEARNS_TO_ASK, same, settings_of, trained_in_parts, trainer_of
 from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_pref.build import load_weights, reload_task
 from torchrl_pref.checkpoints.checkpoint import Checkpoint
@@ -75,6 +76,38 @@ def test_gamma_counts_questions_where_skips_are_free(skip: str) -> None:
     assert torch.allclose(batch["value_target"], target, atol=1e-3)
 
 
+def skip_often(trainer: Any, share: float) -> None:
+    """Let 4 sessions skip this share of the offers, whatever the policy says."""
+    acted = trainer.sessions._acted
+
+    def skip(seen: Any) -> Any:
+        return acted(seen).set("action", (torch.rand(4) >= share).long())
+
+    trainer.sessions._acted = skip
+
+
+@pytest.mark.parametrize("setup", ["query", "feed"])
+@pytest.mark.parametrize("policy", ["scorer", "attention", "paper"])
+def test_sessions_go_as_torchrl_steps_them(setup: str, policy: str) -> None:
+    settings = {**settings_of(setup, policy, steps=30), "skip": "regret"}
+    (trainer, _), (other, _) = trainer_of(settings), trainer_of(settings)
+    env, strategy = other.env, other.policy.strategy
+    env.set_seed(settings["seed"])
+    now, states = env.reset(), []
+    torch.manual_seed(5)
+    with set_exploration_type(ExplorationType.RANDOM):
+        for _ in range(30):
+            step, now = env.step_and_maybe_reset(strategy(now))
+            states.append(step)
+    torch.manual_seed(5)
+    batch, whole = trainer.sessions.collect(), torch.stack(states, 1)
+    for key in (*trainer.policy.actor.in_keys, "logits", "action", "n_asked"):
+        assert torch.equal(batch[key], whole[key]), key
+    for key in ("reward", "done", "terminated", "n_asked"):
+        assert torch.equal(batch["next", key], whole["next", key]), key
+    assert whole["next", "done"].sum() > 4
+
+
 @pytest.mark.parametrize("policy", ["scorer", "attention", "paper"])
 @pytest.mark.parametrize(
     ("setup", "skip"), [("query", "free"), ("feed", "free"), ("feed", "regret")]
@@ -84,19 +117,20 @@ def test_a_batch_has_the_values_of_each_state_and_the_next(
 ) -> None:
     """In mid-session, at its end, and where it was cut off; whatever is remembered of a belief."""
     trainer, _ = trainer_of({**settings_of(setup, policy, steps=11), "skip": skip})
-    step, states = trainer.env.step_and_maybe_reset, []
+    env, states = trainer.env, []
+    advance = env.advance
 
-    def spy(session: Any) -> Any:
-        session, following = step(session)
-        states.append(session.clone())
-        return session, following
+    def spy(hidden: Any, session: Any, action: Any) -> Any:
+        after = advance(hidden, session, action)
+        state, ahead = env.show(session, hidden), env.show(after.session, hidden)
+        for key in ("reward", "terminated", "truncated"):
+            ahead[key] = getattr(after, key)
+        state["next"] = ahead.set("done", after.terminated | after.truncated)
+        states.append(state.clone())
+        return after
 
-    def skip_often(session: Any) -> Any:
-        return strategy(session).set("action", (torch.rand(4) < 0.3).long())
-
-    strategy = trainer.policy.strategy
-    trainer.sessions.strategy = skip_often
-    trainer.env.step_and_maybe_reset = spy  # type: ignore[method-assign]
+    skip_often(trainer, 0.7)
+    env.advance = spy  # type: ignore[method-assign]
     trainer.sessions.collect()  # sessions are in mid-course then
     states.clear()
     batch = trainer.sessions.collect()
@@ -153,13 +187,7 @@ def test_a_batch_has_the_steps_a_session_may_take(setup: str) -> None:
 @pytest.mark.parametrize("setup", ["query", "feed"])
 def test_sessions_are_at_as_many_stages_as_a_batch_is_short(setup: str) -> None:
     trainer, _ = trainer_of(settings_of(setup, steps=None, stages=4))
-    strategy = trainer.sessions.strategy
-
-    def skip(session: Any) -> Any:
-        """A session of a feed then takes as many steps as it has offers."""
-        return strategy(session).set("action", torch.zeros(4, dtype=torch.long))
-
-    trainer.sessions.strategy = skip
+    skip_often(trainer, 1.0)  # a session of a feed then takes as many steps as it has offers
     whole = 4 if setup == "query" else 20
     batches = [trainer.sessions.collect(number) for number in range(8)]
     assert all(batch.shape == (4, whole // 4) for batch in batches)

@@ -77,10 +77,10 @@ class RationalityBelief(Belief):
         )
         return omega * self.spread ** normal.clamp(-FARTHEST, FARTHEST)
 
-    def _foreseen(self, samples: Tensor, answers: Evidence) -> Tensor:
+    def _foreseen(self, samples: Tensor, answers: Evidence, likelihood: Tensor) -> Tensor:
         """See :meth:`Belief._foreseen`."""
         if self._rates is None:
-            return super()._foreseen(samples, answers)
+            return likelihood
         return self._rates.raised(samples, answers)(samples.new_zeros(len(samples)))
 
     def _raised(self, samples: Tensor, answers: Evidence) -> Callable[[Tensor], Tensor]:

@@ -29,6 +29,12 @@ def kish_share(log_weights: Tensor) -> Tensor:
     return total / (square * log_weights.shape[-1]).clamp(min=1e-30)
 
 
+def log_ratio(log_next: Tensor, log_now: Tensor) -> Tensor:
+    """Log-weights (… S M) of samples with log-likelihoods (S M) that become others (… S M)."""
+    # By rounding a sample may lie just outside of where it was moved to, and is dropped.
+    return log_next - log_now.clamp(min=torch.finfo(log_now.dtype).min)
+
+
 def resample(samples: Tensor, log_weights: Tensor, generator: Generator) -> tuple[Tensor, Tensor]:
     """Draw samples in proportion to their weights, systematically: with one number for all.
 

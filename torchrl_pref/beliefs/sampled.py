@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Generator, Tensor
@@ -24,6 +25,7 @@ from torchrl_pref.beliefs.resampling import (
     explained_share,
     furthest,
     kish_share,
+    log_ratio,
     resample,
 )
 from torchrl_pref.beliefs.slice import Target, round_of_moves
@@ -121,10 +123,10 @@ class Belief(BeliefBase):
         """
         check_finite("samples or features of the answers", samples, answers.rows)
         size = max(1, MOVED // (self.n_samples * self._moves_for(samples.shape[-1])))
-        updates = []
-        for first in range(0, max(1, len(samples)), size):
-            some = slice(first, first + size)
-            updates.append(self._update(samples[some], ess[some], answers[some], generator))
+        if len(samples) <= size:
+            return self._update(samples, ess, answers, generator)
+        parts = (slice(first, first + size) for first in range(0, len(samples), size))
+        updates = [self._update(samples[s], ess[s], answers[s], generator) for s in parts]
         return Update(*(torch.cat(field) for field in zip(*updates, strict=True)))
 
     def _moves_for(self, n_features: int) -> int:
@@ -137,19 +139,19 @@ class Belief(BeliefBase):
         """:meth:`update` for as many sessions as are held in memory at once."""
         foreseen = self._likelihood(samples, answers[:, -1])
         limit = math.inf if samples.shape[2] == CIRCLE else SURPRISE
-        anew = foreseen.exp().mean(1) < limit
-        if anew.any():
-            indeed = self._surprised(samples[anew], answers[anew], foreseen[anew].exp(), limit)
-            anew = anew.masked_scatter(anew, indeed)
-        few = ~anew & (kish_share(foreseen) < MIN_SHARE)
+        anew, few = foreseen.exp().mean(1) < limit, kish_share(foreseen) < MIN_SHARE
         inflation = self.n_samples / ess
-        plain = ~(anew | few)
-        if plain.all():
-            after = self._let_in(samples, inflation, answers, generator)
+        if not (anew | few).any():
+            after = self._let_in(samples, inflation, answers, generator, foreseen)
         else:
+            if anew.any():
+                indeed = self._surprised(samples[anew], answers[anew], foreseen[anew].exp(), limit)
+                anew = anew.masked_scatter(anew, indeed)
+            few &= ~anew
+            plain = ~(anew | few)
             after = samples.clone(), inflation, torch.ones_like(plain)
             for who, condition in (
-                (plain, self._let_in),
+                (plain, partial(self._let_in, likelihood=foreseen[plain])),
                 (few, self._let_in_by_stages),
                 (anew, self._begin_anew),
             ):
@@ -163,8 +165,7 @@ class Belief(BeliefBase):
     def _likelihood(self, samples: Tensor, answers: Evidence) -> Tensor:
         """(S M), log-likelihood of an answer (S) or of all answers (S H) under samples (S M D)."""
         gaps, floor = answers.gaps(samples), answers.floor.unsqueeze(1)
-        one = answers.floor.ndim == 1
-        model = self.response_model
+        model, one = self.response_model, answers.floor.ndim == 1
         return (model.answer_log_likelihood if one else model.joint_log_likelihood)(gaps, floor)
 
     def _surprised(
@@ -182,18 +183,23 @@ class Belief(BeliefBase):
         return possible & (foreseen.mean(1) < limit * most)
 
     def _let_in(
-        self, samples: Tensor, inflation: Tensor, answers: Evidence, generator: Generator
+        self,
+        samples: Tensor,
+        inflation: Tensor,
+        answers: Evidence,
+        generator: Generator,
+        likelihood: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Let in the last of the answers at once.
+        """Let in at once the last of the answers, of log-likelihood (S M) under the samples.
 
         Returns:
             Samples (S M D), inflation (S), and that the answer was used (S).
         """
-        model = self.response_model
-        log_weights = self._foreseen(samples, answers)
-        target = Target(answers, torch.zeros_like(inflation), torch.ones_like(inflation), model)
+        one = torch.ones_like(inflation)
+        target = Target(answers, torch.zeros_like(inflation), one, self.response_model)
+        log_weights = self._foreseen(samples, answers, likelihood)
         after = self._resample_move(samples, inflation, log_weights, target, generator)
-        return *after, torch.ones_like(inflation, dtype=torch.bool)
+        return *after, one.bool()
 
     def _let_in_by_stages(
         self, samples: Tensor, inflation: Tensor, answers: Evidence, generator: Generator
@@ -219,7 +225,7 @@ class Belief(BeliefBase):
                 possible = raised(torch.zeros_like(next_slack)) > -math.inf
                 next_slack = torch.where(possible.any(1), 0.0, next_slack)
             slack[todo] = next_slack
-            log_weights = _ratio(raised(next_slack), log_now)
+            log_weights = log_ratio(raised(next_slack), log_now)
             target = Target(answers[todo], next_slack, torch.ones_like(next_slack), model)
             given = samples[todo], inflation[todo], log_weights, target, generator
             samples[todo], inflation[todo] = self._resample_move(*given)
@@ -276,14 +282,14 @@ class Belief(BeliefBase):
             lambda to: kish_share(tempered(power, to)) >= share,
         )
 
-    def _foreseen(self, samples: Tensor, answers: Evidence) -> Tensor:
-        """(S M), log-likelihood of the last of answers (S H) under samples (S M D) of the belief
-        after the others."""
-        return self._likelihood(samples, answers[:, -1])
+    def _foreseen(self, samples: Tensor, answers: Evidence, likelihood: Tensor) -> Tensor:
+        """(S M), log-weights of samples (S M D) of the belief after all answers (S H) but the last,
+        whose log-likelihood under them is given (S M)."""
+        return likelihood
 
     def _raised(self, samples: Tensor, answers: Evidence) -> Callable[[Tensor], Tensor]:
-        """From a slack (… S) to :meth:`_foreseen` (… S M) of gaps that are raised by it; infinite
-        slack gives 0."""
+        """From a slack (… S) to the log-weights (… S M) that let in an answer whose gaps are raised
+        by it; infinite slack gives 0."""
         newest = answers[:, -1]
         gaps, floor = newest.gaps(samples), newest.floor.unsqueeze(1)
 
@@ -305,7 +311,7 @@ class Belief(BeliefBase):
     ) -> Tensor:
         """(S), the smallest slack that keeps enough of samples (S M D) effective."""
         result = torch.zeros_like(slack)
-        few = kish_share(_ratio(self._raised(samples, answers)(result), log_now)) < MIN_SHARE
+        few = kish_share(log_ratio(self._raised(samples, answers)(result), log_now)) < MIN_SHARE
         if few.any():
             raised, log_now = self._raised(samples[few], answers[few]), log_now[few]
             # At this slack every sample agrees, so no factor of the answer tells them far apart.
@@ -314,7 +320,7 @@ class Belief(BeliefBase):
             result[few] = furthest(
                 start,
                 torch.zeros_like(start),
-                lambda to: kish_share(_ratio(raised(to), log_now)) >= MIN_SHARE,
+                lambda to: kish_share(log_ratio(raised(to), log_now)) >= MIN_SHARE,
             )
         return result
 
@@ -333,7 +339,7 @@ class Belief(BeliefBase):
         inflation = 1 + explained_share(start, moved) * excess
         for _ in range(MAX_ROUNDS - 1):
             who = (inflation > 1 / FORGOTTEN).nonzero().squeeze(-1)
-            if who.numel() == 0:
+            if len(who) == 0:
                 break
             moved[who] = self._move(moved[who], target.of(who), generator)
             inflation[who] = 1 + explained_share(start[who], moved[who]) * excess[who]
@@ -342,9 +348,3 @@ class Belief(BeliefBase):
     def _move(self, samples: Tensor, target: Target, generator: Generator) -> Tensor:
         """Samples (S M D) after Markov moves that leave the target invariant."""
         return round_of_moves(samples, self._moves_for(samples.shape[2]), target, generator)
-
-
-def _ratio(log_next: Tensor, log_now: Tensor) -> Tensor:
-    """Log-weights (… S M) of samples with log-likelihoods (S M) that become others (… S M)."""
-    # By rounding a sample may lie just outside of where it was moved to, and is dropped.
-    return log_next - log_now.clamp(min=torch.finfo(log_now.dtype).min)

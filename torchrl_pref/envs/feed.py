@@ -5,13 +5,14 @@ Shapes: as in ``envs.session``.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_pref.beliefs.base import BeliefBase
 from torchrl_pref.envs.session import SessionEnv
-from torchrl_pref.envs.transition import SessionState, Tree
+from torchrl_pref.envs.transition import Outcome, SessionState, Tree
 from torchrl_pref.errors import check_choice, check_count
 from torchrl_pref.humans.base import HumanBase
 from torchrl_pref.humans.demonstrations import Demonstrations
@@ -93,17 +94,18 @@ class FeedEnv(SessionEnv):
         place = session["n_offered" if self.on_skip == "new" else "n_asked"]
         return hidden["offers"].gather(-1, place.clamp(max=self.n_offers - 1)).squeeze(-1)
 
-    def _shown(self, session: SessionState, hidden: Tree) -> dict[str, Tensor]:
-        shown, n_offered = super()._shown(session, hidden), session["n_offered"]
+    def shown(self, session: SessionState, hidden: Tree) -> dict[str, Tensor]:
+        """See :meth:`SessionEnv.shown`."""
+        shown, n_offered = super().shown(session, hidden), session["n_offered"]
         offers_left = 1 - n_offered / self.n_offers
         shown["remaining"] = torch.cat([shown["remaining"], offers_left], -1)
         shown["n_offered"] = n_offered.clone()
         shown["offer"] = self.features[self.offered(session, hidden)]
         return shown
 
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action = self._check_action(tensordict, 2, "1 to ask and 0 to skip")
-        hidden, session = self._session_of(tensordict)
+    def advance(self, hidden: Tree, session: SessionState, action: Any) -> Outcome:
+        """See :meth:`SessionEnv.advance`."""
+        action = self._check_action(action, 2, "1 to ask and 0 to skip")
         human, index = hidden["human"], self.offered(session, hidden)
         n_offered = session["n_offered"]
         going_on = (session["n_asked"] < self.budget) & (n_offered < self.n_offers)
@@ -121,4 +123,4 @@ class FeedEnv(SessionEnv):
         if self.skip == "free":
             # Scarce offers are part of the task, and nothing is to come after the last.
             terminated = terminated | out_of_offers
-        return self._finish(after, hidden, reward, out_of_offers, terminated)
+        return Outcome(after, reward, terminated, out_of_offers & ~terminated)

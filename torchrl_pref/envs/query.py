@@ -5,15 +5,16 @@ Shapes: as in ``envs.session``, and n questions asked at once.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite
 
 from torchrl_pref.beliefs.base import BeliefBase
 from torchrl_pref.envs.allowed import AllowedActions, Table
 from torchrl_pref.envs.session import SessionEnv
-from torchrl_pref.envs.transition import SessionState, Tree
+from torchrl_pref.envs.transition import Outcome, SessionState, Tree
 from torchrl_pref.errors import InputError, check_batch, check_count, check_flag
 from torchrl_pref.humans.base import HumanBase
 from torchrl_pref.humans.demonstrations import Demonstrations
@@ -116,8 +117,9 @@ class QueryEnv(SessionEnv):
         """Whether the whole pool is on the table, in order; an action is then its index."""
         return self.n_candidates == len(self.features)
 
-    def _shown(self, session: SessionState, hidden: Tree) -> dict[str, Tensor]:
-        shown, size = super()._shown(session, hidden), len(session["n_asked"])
+    def shown(self, session: SessionState, hidden: Tree) -> dict[str, Tensor]:
+        """See :meth:`SessionEnv.shown`."""
+        shown, size = super().shown(session, hidden), len(session["n_asked"])
         if self._shows_all:
             # A view: the whole pool is the same for every session. Torch lets nobody write into
             # it, but where there is one session: that gets a copy.
@@ -136,9 +138,9 @@ class QueryEnv(SessionEnv):
         shown["action_mask"] = mask
         return shown
 
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        index = self._check_action(tensordict, self.n_candidates, "the place of a candidate")
-        hidden, session = self._session_of(tensordict)
+    def advance(self, hidden: Tree, session: SessionState, action: Any) -> Outcome:
+        """See :meth:`SessionEnv.advance`."""
+        index = self._check_action(action, self.n_candidates, "the place of a candidate")
         index = index.reshape(-1, self.batch)
         if not self._shows_all:
             index = hidden["candidates"].gather(-1, index)
@@ -150,7 +152,7 @@ class QueryEnv(SessionEnv):
             after = self._ask(after, human, query, going_on)
         reward = self._objective.gained(session, after, human)
         terminated = after["n_asked"] >= self.budget
-        return self._finish(after, hidden, reward, torch.zeros_like(terminated), terminated)
+        return Outcome(after, reward, terminated, torch.zeros_like(terminated))
 
     def _check_new(self, session: SessionState, index: Tensor) -> None:
         """Refuse to ask pool queries ``index`` (B n) again in a session that goes on."""

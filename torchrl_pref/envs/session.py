@@ -50,6 +50,7 @@ from torchrl_pref.beliefs.base import BeliefBase
 from torchrl_pref.envs.objectives import make_objective
 from torchrl_pref.envs.state import check_state, overwrite, spec_of
 from torchrl_pref.envs.transition import (
+    Outcome,
     SessionState,
     Tree,
     begin,
@@ -119,10 +120,10 @@ class SessionEnv(EnvBase):
     def _make_specs(self, n_actions: int) -> None:
         """Read the specs off a state, so that no shape is written down twice."""
         rng_state = self._generator.get_state()
-        hidden, session = self._fresh()
+        hidden, session = self.fresh()
         self._generator.set_state(rng_state)
         batch, device = self.batch_size, self.device
-        shown = self._shown(session, hidden)
+        shown = self.shown(session, hidden)
         kept = {"session": session}
         self.state_spec = spec_of(TensorDict({**hidden, **kept}, batch, device=device))
         self.observation_spec = spec_of(TensorDict({**shown, **kept}, batch, device=device))
@@ -172,7 +173,7 @@ class SessionEnv(EnvBase):
     def _reset(
         self, tensordict: TensorDictBase | None = None, set_state: bool = False, **kwargs: Any
     ) -> TensorDictBase:
-        hidden, session = self._fresh()
+        hidden, session = self.fresh()
         if set_state and tensordict is not None:
             state = TensorDict({**hidden, "session": session}, self.batch_size, device=self.device)
             given = check_state(tensordict, state, len(self.features), self.n_answers)
@@ -182,16 +183,16 @@ class SessionEnv(EnvBase):
             session["mean"] = directions(session["samples"]).mean(1)
         mask = None if tensordict is None else tensordict.get("_reset", None)
         self._remember(hidden, mask)
-        shown = self._shown(session, hidden)
+        shown = self.shown(session, hidden)
         self._put_on_table(shown, mask)
         return TensorDict(
             {**hidden, "session": session, **shown}, self.batch_size, device=self.device
         )
 
-    def _fresh(self) -> tuple[Tree, SessionState]:
-        """New humans who have answered nothing. The draws that strategies share come first."""
+    def fresh(self) -> tuple[Tree, SessionState]:
+        """What is hidden and what is kept of B new sessions, in which nothing was asked yet."""
         size, (_, n_options, n_features) = self.batch_size.numel(), self.features.shape
-        rng = self.generator
+        rng = self.generator  # the draws that strategies share come first
         human = self.human.draw(size, self.budget, self.n_answers, n_features, rng).to_dict()
         session = begin(self.belief.prior(size, n_features, rng), self.budget, n_options)
         # The bits of a number of the prior: another one for each session, and no draw more.
@@ -219,7 +220,7 @@ class SessionEnv(EnvBase):
         """Sessions that begin, with their numbers. Subclasses may add what else is counted."""
         return {**session, "number": number}
 
-    def _shown(self, session: SessionState, hidden: Tree) -> dict[str, Tensor]:
+    def shown(self, session: SessionState, hidden: Tree) -> dict[str, Tensor]:
         """What a policy sees: copies, which may be rewritten. Subclasses add what is asked."""
         n_asked = session["n_asked"]
         return {
@@ -236,7 +237,7 @@ class SessionEnv(EnvBase):
             session: what is known of them, of as many as there are.
             hidden: what :meth:`draw_questions` drew for them.
         """
-        shown = {**self._shown(session, hidden), "session": session}
+        shown = {**self.shown(session, hidden), "session": session}
         return TensorDict(shown, session["n_asked"].shape[:1], device=self.device)
 
     def _put_on_table(self, shown: dict[str, Tensor], begun: Tensor | None) -> None:
@@ -283,9 +284,9 @@ class SessionEnv(EnvBase):
             put(remembered, rows(hidden, who), who)
             self._remembered = remembered
 
-    def _check_action(self, tensordict: TensorDictBase, n_actions: int, meaning: str) -> Tensor:
+    def _check_action(self, action: Any, n_actions: int, meaning: str) -> Tensor:
         """The action of each session; refused unless it is from 0 to ``n_actions`` - 1."""
-        action = check_range("action", tensordict.get("action"), 0, n_actions - 1, meaning)
+        action = check_range("action", action, 0, n_actions - 1, meaning)
         each = "one number" if self.batch == 1 else f"{self.batch} numbers"
         check_shape("action", action, self._action_shape, f"{each} for each session")
         return action
@@ -313,21 +314,27 @@ class SessionEnv(EnvBase):
         answers = self.human.respond(seen, human, session["n_asked"].squeeze(-1))
         return tell(self.belief, session, options, answers, index, self.generator)
 
-    def _finish(
-        self,
-        session: SessionState,
-        hidden: Tree,
-        reward: Tensor,
-        truncated: Tensor,
-        terminated: Tensor,
-    ) -> TensorDict:
-        """The next state with its reward and done flags; what is hidden stays where it is."""
-        flags = {"terminated": terminated, "truncated": truncated & ~terminated}
-        done = {"done": terminated | truncated, **flags, "reward": reward}
-        shown = self._shown(session, hidden)
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        hidden, session = self._session_of(tensordict)
+        session, reward, terminated, truncated = self.advance(
+            hidden, session, tensordict.get("action")
+        )
+        shown = self.shown(session, hidden)
         self._put_on_table(shown, None)
-        after = {"session": session, **shown, **done}
+        flags = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
+        # What is hidden stays where it is.
+        after = {"session": session, **shown, **flags, "reward": reward}
         return TensorDict(after, self.batch_size, device=self.device)
 
     @abstractmethod
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase: ...
+    def advance(self, hidden: Tree, session: SessionState, action: Any) -> Outcome:
+        """A step, without a tensordict: what is hidden stays, and what is known changes.
+
+        Args:
+            hidden: of the sessions, as :meth:`fresh` gives it.
+            session: what is known of them.
+            action: (B), or (B n) where an action asks several questions.
+
+        Raises:
+            InputError: an action is out of range, or asks again what may not be.
+        """

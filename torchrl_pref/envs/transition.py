@@ -9,7 +9,7 @@ writes to nothing that it is given, and all its luck comes from the generator.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NotRequired, TypeAlias, TypedDict, cast
+from typing import Any, NamedTuple, NotRequired, TypeAlias, TypedDict, cast
 
 import torch
 from torch import Generator, Tensor
@@ -64,6 +64,19 @@ class SessionState(TypedDict):
     """(B 1), queries offered so far, where they are offered."""
     number: NotRequired[Tensor]
     """(B 1), tells a session of an environment from another."""
+
+
+class Outcome(NamedTuple):
+    """What came of an action."""
+
+    session: SessionState
+    """What is known after it."""
+    reward: Tensor
+    """(B 1)."""
+    terminated: Tensor
+    """(B 1) bool, whether nothing is to come after it."""
+    truncated: Tensor
+    """(B 1) bool, whether it was cut off where more would have come."""
 
 
 def begin(samples: Tensor, budget: int, n_options: int) -> SessionState:

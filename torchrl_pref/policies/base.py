@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import torch
@@ -15,7 +16,7 @@ from tensordict.nn import (
 )
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
-from torchrl.modules import MLP, MaskedCategorical, ProbabilisticActor, ValueOperator
+from torchrl.modules import MLP, MaskedCategorical, ProbabilisticActor
 
 from torchrl_pref.beliefs.resampling import covariance_of
 from torchrl_pref.envs.session import is_feed
@@ -49,7 +50,7 @@ class Policy:
         modules = (self.actor,) if self.observe is None else (self.observe, self.actor)
         return Acting(*modules)
 
-    @property
+    @cached_property
     def weights(self) -> nn.ModuleDict:
         """All that is learned, to be saved and loaded by its ``state_dict``."""
         return nn.ModuleDict({"actor": self.actor, "critic": self.critic})
@@ -116,10 +117,10 @@ def _belief_features(summary: Callable[[Tensor], Tensor]) -> Layer:
 def _belief_critic(n_shares: int, device: torch.device) -> TensorDictSequential:
     """The critic, from the session on: its own features remember nothing, so that it can be called
     on any batch and under ``torch.vmap``, as TorchRL's advantages do."""
-    value = ValueOperator(
-        MLP(N_BELIEF + n_shares, 1, num_cells=[32, 32], activation_class=nn.Tanh, device=device),
-        in_keys=["belief_features"],
+    network = MLP(
+        N_BELIEF + n_shares, 1, num_cells=[32, 32], activation_class=nn.Tanh, device=device
     )
+    value = Layer(network, in_keys=["belief_features"], out_keys=["state_value"])
     return TensorDictSequential(_belief_features(belief_summary), value)
 
 

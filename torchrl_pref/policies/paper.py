@@ -9,7 +9,7 @@ from tensordict.nn import (
 )
 from torch import nn
 from torchrl.envs import EnvBase
-from torchrl.modules import MLP, ValueOperator
+from torchrl.modules import MLP
 
 from torchrl_pref.envs.session import is_feed
 from torchrl_pref.policies.base import (
@@ -41,7 +41,9 @@ def paper_policy(env: EnvBase) -> Policy:
     cells = {"num_cells": [64, 64], "activation_class": nn.Tanh, "device": device}
     network = MLP(size, env.action_spec.space.n, **cells)
     logits = Layer(network, in_keys=state_keys, out_keys=["logits"])
-    critic: TensorDictModuleBase = ValueOperator(MLP(size, 1, **cells), in_keys=state_keys)
+    critic: TensorDictModuleBase = Layer(
+        MLP(size, 1, **cells), in_keys=state_keys, out_keys=["state_value"]
+    )
     if observe is not None:
         critic = TensorDictSequential(observe, critic)
     return Policy(observe, _actor(logits, env), critic)

@@ -25,6 +25,7 @@ class A2C(ActorCritic):
             entropy_coeff=settings.entropy,
             critic_coeff=settings.critic,
             loss_critic_type="l2",
+            functional=False,  # no copy of the weights is asked for, and a loss takes a third less
         )
         super().__init__(policy, loss, settings)
 

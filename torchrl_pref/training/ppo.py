@@ -51,6 +51,7 @@ class PPO(ActorCritic):
             entropy_coeff=settings.entropy,
             critic_coeff=settings.critic,
             loss_critic_type="l2",
+            functional=False,  # as in A2C
             log_explained_variance=False,  # the trainer measures it, over the whole batch
         )
         super().__init__(policy, loss, settings)

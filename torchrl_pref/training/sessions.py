@@ -6,25 +6,27 @@ Shapes: B sessions side by side, T steps of each in a batch.
 from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_pref.checkpoints.restore import restore_sessions
 from torchrl_pref.envs.feed import FeedEnv
 from torchrl_pref.envs.objectives import alignment
 from torchrl_pref.envs.query import QueryEnv
+from torchrl_pref.envs.transition import SessionState, Tree, put, rows
 from torchrl_pref.policies.base import Policy
 
 
 class Sessions:
     """B sessions that go on from one batch to the next; one that ends makes room for another.
 
-    A batch holds what the networks read and the logits that the actor gave, and not the samples or
-    the pool: it is a hundredth of what the steps themselves are.
+    They are advanced by the environment's own step without its tensordict, which would take longer
+    than the step itself where there is one session. A batch holds what the networks read and the
+    logits that the actor gave, and not the samples or the pool: it is a hundredth of what the steps
+    themselves are.
 
     Args:
         env: its batch size is B.
@@ -35,25 +37,28 @@ class Sessions:
             their end.
 
     Attributes:
-        now: the sessions as they stand, with the reward (``episode_reward``) and the number of
-            steps (``step_count``) that each has had.
+        hidden: what is hidden of the sessions as they stand.
+        session: what is known of them.
+        counts: the reward (``episode_reward``) and the number of steps (``step_count``) that each
+            has had, (B 1).
     """
 
     def __init__(
         self, env: QueryEnv | FeedEnv, policy: Policy, steps: int, stages: int = 1
     ) -> None:
         self.env, self.policy, self.steps, self.stages = env, policy, steps, stages
-        self.strategy = policy.strategy
+        # A policy may read parts of what is kept, as ("session", "ess").
+        keys = (*policy.strategy.in_keys, *policy.critic.in_keys, "n_asked")
+        self.read = {key if isinstance(key, str) else key[0] for key in keys}
         self.kept = {*policy.actor.in_keys, *policy.value.in_keys, "logits", "action", "n_asked"}
-        self.now: TensorDictBase = env.reset()
-        self.now["episode_reward"] = torch.zeros_like(self.now["remaining"][..., :1])
-        self.now["step_count"] = torch.zeros_like(self.now["n_asked"])
-        self._state_keys = tuple(self.now.keys())
+        self.hidden, self.session = env.fresh()
+        zero = torch.zeros_like(self.session["n_asked"])
+        self.counts = {"episode_reward": zero.float(), "step_count": zero}
 
     @property
     def frames(self) -> int:
         """B · T, steps in a batch."""
-        return self.now.numel() * self.steps
+        return self.env.batch_size.numel() * self.steps
 
     @property
     def generator(self) -> torch.Generator:
@@ -65,8 +70,8 @@ class Sessions:
         return nullcontext()
 
     def state_dict(self) -> dict[str, Any]:
-        """The sessions as they stand, without what the policy wrote beside them."""
-        return self.now.select(*self._state_keys).to_dict()
+        """The sessions as they stand."""
+        return {**self.hidden, "session": self.session, **self.counts}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on where :meth:`state_dict` was taken.
@@ -74,10 +79,13 @@ class Sessions:
         Raises:
             InputError: the state was taken of other sessions.
         """
-        self.now = self.now.select(*self._state_keys)
-        session = self.now.select(*self.env.state_spec.keys())
-        sizes = len(self.env.features), self.env.n_answers
-        restore_sessions(self.now, state, session, *sizes)
+        now = TensorDict(self.state_dict(), self.env.batch_size, device=self.env.device)
+        session = now.select(*self.env.state_spec.keys())
+        restore_sessions(now, state, session, len(self.env.features), self.env.n_answers)
+        saved = now.to_dict()
+        self.hidden = {key: saved[key] for key in self.hidden}
+        self.counts = {key: saved[key] for key in self.counts}
+        self.session = cast(SessionState, saved["session"])
 
     @torch.no_grad()
     def collect(self, before: int = 0) -> TensorDict:
@@ -92,56 +100,83 @@ class Sessions:
         session ended (else NaN), and the ``episode_reward`` and ``step_count`` with the step.
         """
         if 0 < before < self.stages:
-            self._begin_again(torch.arange(self.now.numel()) % self.stages == before)
-        records, cut_off = [], []
-        with set_exploration_type(ExplorationType.RANDOM):
-            for t in range(self.steps):
-                record, after = self._step()
-                records.append(record)
-                cut = after["truncated"].squeeze(-1)
-                if cut.any():
-                    cut_off.append((cut, t, self._value(after[cut])))
-        batch = TensorDict.stack(records, 1)
+            places = torch.arange(self.env.batch_size.numel(), device=self.env.device)
+            self._begin_again((places % self.stages == before).nonzero().squeeze(-1))
+        records: list[Tree] = []
+        cut_off: list[tuple[int, Tensor, Tensor]] = []
+        for t in range(self.steps):
+            record, cut = self._step()
+            records.append(record)
+            cut_off += [] if cut is None else [(t, *cut)]
+        steps = {key: torch.stack([one[key] for one in records], 1) for key in records[0]}
+        batch = TensorDict(steps, (self.env.batch_size.numel(), self.steps))
         self.policy.value(batch)
-        values = torch.cat([batch["state_value"], self._value(self.now).unsqueeze(1)], 1)
+        last = self._value(self._seen(self.session, self.hidden))
+        values = torch.cat([batch["state_value"], last.unsqueeze(1)], 1)
         # The state after a step is the one before the next, but where a session was cut off.
         later = values[:, 1:].clone()
-        for cut, t, value in cut_off:
-            later[cut, t] = value
+        for t, who, value in cut_off:
+            later[who, t] = value
         batch["next", "state_value"] = later
         return batch
 
-    def _begin_again(self, chosen: Tensor) -> None:
-        """Put those of the sessions (B) that are chosen at their start."""
-        chosen = chosen.unsqueeze(-1).to(self.now.device)
-        for flag in ("done", "terminated"):
-            self.now[flag] = self.now[flag] | chosen
-        counts = {key: self.now[key] * ~chosen for key in ("episode_reward", "step_count")}
-        self.now = self.env.maybe_reset(self.now).update(counts)
+    def _begin_again(self, who: Tensor) -> None:
+        """Put sessions ``who`` at their start."""
+        if len(who):
+            hidden, session = self.env.fresh()
+            now = {**self.hidden, "session": self.session}
+            put(now, rows({**hidden, "session": session}, who), who)
+            self.session = now.pop("session")
+            self.hidden = now
+            self.counts = {key: count.index_fill(0, who, 0) for key, count in self.counts.items()}
 
-    def _step(self) -> tuple[TensorDict, TensorDictBase]:
-        """One step of all sessions: what is kept of it, and the state after it."""
-        session, following = self.env.step_and_maybe_reset(self.strategy(self.now))
-        after, record = session["next"], session.select(*self.kept)
-        total = session["episode_reward"] + after["reward"]
-        count = session["step_count"] + 1
-        kept = {key: after[key] for key in ("reward", "done", "terminated", "n_asked")}
-        kept["alignment"] = torch.full_like(after["reward"], torch.nan)
-        ended = after["done"].squeeze(-1).nonzero().squeeze(-1)
-        if len(ended):  # of the others nobody asks, and a step would be a tenth slower
-            samples, omega = after["session", "samples"], session["human", "omega"]
-            kept["alignment"][ended] = alignment(samples[ended], omega[ended])
-        record["next"] = TensorDict(
-            {**kept, "episode_reward": total, "step_count": count}, self.env.batch_size
-        )
-        going_on = ~after["done"]
-        following["episode_reward"], following["step_count"] = total * going_on, count * going_on
-        self.now = following
-        return record, after
+    def _step(self) -> tuple[Tree, tuple[Tensor, Tensor] | None]:
+        """One step of all sessions: what is kept of it, and of those that it cut off which they
+        are, and what the critic gave to them then."""
+        seen = self._acted(self._seen(self.session, self.hidden))
+        after = self.env.advance(self.hidden, self.session, seen["action"])
+        self.session = after.session
+        self.counts = {
+            "episode_reward": self.counts["episode_reward"] + after.reward,
+            "step_count": self.counts["step_count"] + 1,
+        }
+        done = after.terminated | after.truncated
+        ahead = {
+            "reward": after.reward,
+            "done": done,
+            "terminated": after.terminated,
+            "n_asked": after.session["n_asked"],
+            "alignment": torch.full_like(after.reward, torch.nan),
+            **self.counts,
+        }
+        record = {**{key: seen[key] for key in self.kept}, **{("next", k): ahead[k] for k in ahead}}
+        cut_off = None
+        if done.any():
+            ended, cut = (of.squeeze(-1).nonzero().squeeze(-1) for of in (done, after.truncated))
+            # Of those that go on nobody asks it, and a step would be a tenth slower.
+            samples, omega = after.session["samples"][ended], self.hidden["human"]["omega"][ended]
+            ahead["alignment"][ended] = alignment(samples, omega)
+            if len(cut):
+                session = cast(SessionState, rows(after.session, cut))
+                cut_off = cut, self._value(self._seen(session, rows(self.hidden, cut)))
+            self._begin_again(ended)
+        return record, cut_off
 
-    def _value(self, session: TensorDictBase) -> Tensor:
-        """What the critic gives to sessions (B), (B 1)."""
-        seen = session.copy()
-        if self.policy.observe is not None:
-            seen = self.policy.observe(seen)
-        return self.policy.value(seen)["state_value"]
+    def _seen(self, session: SessionState, hidden: Tree) -> TensorDictBase:
+        """What the networks read of sessions."""
+        state = {**self.env.shown(session, hidden), "session": session}
+        read = {key: state[key] for key in self.read & state.keys()}
+        seen = TensorDict(read, session["n_asked"].shape[:1])
+        return seen if self.policy.observe is None else self.policy.observe(seen)
+
+    def _acted(self, seen: TensorDictBase) -> TensorDictBase:
+        """With an ``action`` drawn for each session, and what it was drawn by."""
+        *networks, head = self.policy.actor.module
+        for network in networks:
+            seen = network(seen)
+        return seen.set("action", head.get_dist(seen).sample())
+
+    def _value(self, seen: TensorDictBase) -> Tensor:
+        """What the critic gives to sessions, (B 1)."""
+        value: Tensor = self.policy.value(seen)["state_value"]
+        return value

@@ -149,14 +149,14 @@ class Trainer:
         told = {"entropy": entropy, "learning_rate": rate}
         told |= self.algorithm.learn(flat, only_critic)
         self.algorithm.fit_critic(flat)
-        for name, weight in self.policy.weights.state_dict().items():
-            self.average[name].lerp_(weight, 1 - self.settings.average)
+        for average, weight in zip(self.average.values(), self._weights.values(), strict=True):
+            average.lerp_(weight, 1 - self.settings.average)
         return told
 
     def start_average(self) -> None:
         """Begin the average of the weights with what the policy holds now."""
-        weights = self.policy.weights.state_dict()
-        self.average = {name: weight.clone() for name, weight in weights.items()}
+        self._weights = self.policy.weights.state_dict()  # they change where they are
+        self.average = {name: weight.clone() for name, weight in self._weights.items()}
 
     def state_dict(self) -> dict[str, Any]:
         """Plain data and tensors that :meth:`load_state_dict` goes on from, bit for bit."""

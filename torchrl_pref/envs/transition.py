@@ -160,13 +160,13 @@ def tell(
         )
     last = belief.response_model.n_answers(options.shape[-2]) - 1
     answers = check_range("answers", answers, REFUSED, last, "-2 where refused")
-    if (answers == OPEN).any():
-        raise InputError("answers of -1: expected an option from 0, or -2 where it was refused")
     after: Tree = dict(session)
     heard = (answers >= 0).nonzero().squeeze(-1)
     if len(heard) == len(answers):
         marks = _learn(belief, after, options, answers, generator)
     else:
+        if (answers == OPEN).any():
+            raise InputError("answers of -1: expected an option from 0, or -2 where it was refused")
         part = rows(session, heard)
         marks = answers.clone()
         if len(heard):

@@ -81,9 +81,12 @@ class Boltzmann(ResponseModel):
 
     def __call__(self, returns: Tensor) -> Tensor:
         """See :meth:`ResponseModel.__call__`."""
-        if returns.shape[-1] == 2 or not self.is_plain:
+        if not self.is_plain:
             return super().__call__(returns)
-        # The same for all K options at once, in K exponentials and not K².
+        # The same as in general, in K exponentials and not K².
+        if returns.shape[-1] == 2:
+            lead = returns[..., 0] - returns[..., 1]
+            return F.logsigmoid(self.tau * torch.stack([lead, -lead])).movedim(0, -1)
         return torch.log_softmax(self.tau * returns.movedim(-1, 0), 0).movedim(0, -1)
 
     def predict(self, leads: Tensor) -> Prediction:

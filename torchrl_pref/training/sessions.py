@@ -54,6 +54,7 @@ class Sessions:
         self.hidden, self.session = env.fresh()
         zero = torch.zeros_like(self.session["n_asked"])
         self.counts = {"episode_reward": zero.float(), "step_count": zero}
+        self._now = self._seen(self.session, self.hidden)
 
     @property
     def frames(self) -> int:
@@ -86,6 +87,7 @@ class Sessions:
         self.hidden = {key: saved[key] for key in self.hidden}
         self.counts = {key: saved[key] for key in self.counts}
         self.session = cast(SessionState, saved["session"])
+        self._now = self._seen(self.session, self.hidden)
 
     @torch.no_grad()
     def collect(self, before: int = 0) -> TensorDict:
@@ -102,6 +104,7 @@ class Sessions:
         if 0 < before < self.stages:
             places = torch.arange(self.env.batch_size.numel(), device=self.env.device)
             self._begin_again((places % self.stages == before).nonzero().squeeze(-1))
+            self._now = self._seen(self.session, self.hidden)
         records: list[Tree] = []
         cut_off: list[tuple[int, Tensor, Tensor]] = []
         for t in range(self.steps):
@@ -111,8 +114,7 @@ class Sessions:
         steps = {key: torch.stack([one[key] for one in records], 1) for key in records[0]}
         batch = TensorDict(steps, (self.env.batch_size.numel(), self.steps))
         self.policy.value(batch)
-        last = self._value(self._seen(self.session, self.hidden))
-        values = torch.cat([batch["state_value"], last.unsqueeze(1)], 1)
+        values = torch.cat([batch["state_value"], self._value(self._now).unsqueeze(1)], 1)
         # The state after a step is the one before the next, but where a session was cut off.
         later = values[:, 1:].clone()
         for t, who, value in cut_off:
@@ -133,7 +135,7 @@ class Sessions:
     def _step(self) -> tuple[Tree, tuple[Tensor, Tensor] | None]:
         """One step of all sessions: what is kept of it, and of those that it cut off which they
         are, and what the critic gave to them then."""
-        seen = self._acted(self._seen(self.session, self.hidden))
+        seen = self._acted(self._now)
         after = self.env.advance(self.hidden, self.session, seen["action"])
         self.session = after.session
         self.counts = {
@@ -160,6 +162,7 @@ class Sessions:
                 session = cast(SessionState, rows(after.session, cut))
                 cut_off = cut, self._value(self._seen(session, rows(self.hidden, cut)))
             self._begin_again(ended)
+        self._now = self._seen(self.session, self.hidden)
         return record, cut_off
 
     def _seen(self, session: SessionState, hidden: Tree) -> TensorDictBase:

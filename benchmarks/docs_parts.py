@@ -285,6 +285,9 @@ PARTS: dict[str, Part] = {
         "--seed 1 --plot {folder}/calibration.png",
         choose=docs_tables.inferred,
     ),
+    "rationality_bound": benchmark(
+        "rationality_bound", "docs/beliefs.md", 9, "--seed 1", choose=docs_tables.inferred
+    ),
     "laplace": benchmark("laplace", "docs/beliefs.md", 2),
     "humans": benchmark("humans", "docs/humans.md", 8),
     "metrics": Part("docs/metrics.md", tuple(on_beliefs()), 5, docs_records.metrics),

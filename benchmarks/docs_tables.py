@@ -68,9 +68,13 @@ def inferred(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """What ``rationality.py`` measured, with three decimals each, and some of the intervals."""
     shown = [key for key in rows[0] if "%" not in key or key in ("50%", "80%", "90%", "95%")]
     return [
-        {key: str(Fraction(row[key])) if key == "factor" else _decimals(row[key]) for key in shown}
+        {key: _share(row[key]) if key == "factor" else _decimals(row.get(key, "")) for key in shown}
         for row in rows
     ]
+
+
+def _share(value: Any) -> str:
+    return value if isinstance(value, str) else str(Fraction(value))
 
 
 def _decimals(value: Any) -> Any:

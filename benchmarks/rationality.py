@@ -20,6 +20,7 @@ from itertools import product
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from tensordict import TensorDictBase
 from torch import Generator, Tensor
 
 from benchmarks import common
@@ -68,16 +69,14 @@ def main() -> None:
             row: common.Row = {"pool": name, "greedy by": how, "factor": factor}
             found = {}
             for kind, belief in beliefs(factor, options.lapse).items():
-                samples, omega = asked(pool, belief, how, factor, options.humans, options.seed)
-                found[kind] = alignment_of_mean(samples, omega).squeeze(-1)
-                row[kind] = float(found[kind][:, -1].mean())
-                last = samples[:, -1], omega[:, -1]
+                done = asked(pool, belief, how, factor, options.humans, options.seed)
+                last = done["session", "samples"], done["human", "omega"]
+                found[kind] = alignment_of_mean(*last).squeeze(-1)
+                row[kind] = float(found[kind].mean())
                 inside.setdefault(kind, []).append(coverage(*last))
                 foreseen.setdefault(kind, []).append(predicted(*last, belief, factor))
             for other in ("told wrongly", "told rightly"):
-                gain = (found["inferred"] - found[other])[:, -1]
-                error = float(gain.std() / len(gain) ** 0.5)
-                row[f"less {other}"] = f"{float(gain.mean()):+.3f} ± {error:.3f}"
+                row[f"less {other}"] = difference(found["inferred"] - found[other])
             cosines.append(row)
         for kind, each in inside.items():
             shares = torch.stack(each).mean(0).tolist()
@@ -116,16 +115,21 @@ def beliefs(factor: float, lapse: float) -> dict[str, BeliefBase]:
 
 def asked(
     pool: QueryPool, belief: BeliefBase, how: str, factor: float, humans: int, seed: int
-) -> tuple[Tensor, Tensor]:
-    """Samples (S H M D) after each answer, and the humans' weights (S H D)."""
+) -> TensorDictBase:
+    """The sessions (S) after the last answer, with their humans."""
     human = SimulatedHuman(Boltzmann(common.TAU))
     env = QueryEnv(pool, human, belief, BUDGET, batch_size=(humans,), seed=seed)
     start = env.reset()
     start["human", "care"].fill_(factor)
     start = env.reset(start, set_state=True)
     strategy = Greedy(belief.response_model, ACQUISITIONS[how])
-    done = env.rollout(BUDGET, strategy, auto_reset=False, tensordict=start)
-    return done["next", "session", "samples"], done["human", "omega"]
+    done = env.rollout(BUDGET, strategy, auto_reset=False, tensordict=start)[:, -1]
+    return done["next"].set("human", done["human"])
+
+
+def difference(values: Tensor) -> str:
+    """The mean of paired differences (n), ± one standard error."""
+    return f"{float(values.mean()):+.3f} ± {float(values.std() / len(values) ** 0.5):.3f}"
 
 
 def coverage(samples: Tensor, omega: Tensor) -> Tensor:

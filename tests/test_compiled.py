@@ -8,16 +8,18 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
 import torch
 from numba import config
 
-import torchrl_pref.beliefs.elementary_cpu
 from torchrl_pref.acquisition.functions import information_gain
 from torchrl_pref.acquisition.scoring import score_queries
+from torchrl_pref.beliefs import elementary_cpu, slice_cpu
 from torchrl_pref.beliefs.elementary_cpu import cos_sin_single, exp_minus, log, log_single
+from torchrl_pref.beliefs.lengths_cpu import SLICE_DIGEST
 from torchrl_pref.beliefs.sampled import Belief
 from torchrl_pref.beliefs.slice_cpu import ELEMENTARY_DIGEST
 from torchrl_pref.compiled import FEWEST, over_sessions, share_out
@@ -156,8 +158,15 @@ def test_logarithms_and_angles_are_those_of_the_library() -> None:
         assert exp_minus(x) == pytest.approx(np.exp(-x), rel=1e-4, abs=2e-7)
 
 
-def test_moves_are_compiled_anew_when_the_file_that_they_call_changes() -> None:
-    """The digest in ``slice_cpu.py`` is that of the file: put it there after a change."""
-    source = Path(str(torchrl_pref.beliefs.elementary_cpu.__file__)).read_bytes()
-    assert hashlib.sha256(source).hexdigest().startswith(ELEMENTARY_DIGEST)
-    assert len(ELEMENTARY_DIGEST) == 12
+@pytest.mark.parametrize(
+    ("called", "digest"),
+    [(elementary_cpu, ELEMENTARY_DIGEST), (slice_cpu, SLICE_DIGEST)],
+    ids=["elementary_cpu", "slice_cpu"],
+)
+def test_moves_are_compiled_anew_when_the_file_that_they_call_changes(
+    called: ModuleType, digest: str
+) -> None:
+    """The digest in the file that calls it is that of the file: put it there after a change."""
+    source = Path(str(called.__file__)).read_bytes()
+    assert hashlib.sha256(source).hexdigest().startswith(digest)
+    assert len(digest) == 12

@@ -5,7 +5,7 @@ in the user's cache; where none of these can be written, each process compiles a
 made anew when its own file changes and not when another does: a compiled function calls only those
 of its own file, or of one whose digest its own file holds (``beliefs/slice_cpu.py``).
 
-The two long loops over sessions, moves and scores, are shared out among threads, each of which
+The long loops over sessions, of moves and of scores, are shared out among threads, each of which
 takes some of the sessions: as many as ``NUMBA_NUM_THREADS``, by default one for each core. No
 number depends on how many there are.
 """

@@ -12,7 +12,12 @@ from torch import Generator, Tensor
 from torchrl_pref.acquisition.functions import alignment_gain, information_gain
 from torchrl_pref.acquisition.scoring import score_in_tensors, score_queries
 from torchrl_pref.beliefs.lapses import RATES, SHARES
-from torchrl_pref.beliefs.rationality import RationalityBelief
+from torchrl_pref.beliefs.rationality import (
+    RationalityBelief,
+    compiled_lengths,
+    move_lengths,
+    tensor_lengths,
+)
 from torchrl_pref.beliefs.sampled import uniform_sphere
 from torchrl_pref.beliefs.slice import ARC, MAX_SHRINKS, Target, compiled_moves, tensor_moves
 from torchrl_pref.envs.transition import begin, hear, tell
@@ -172,7 +177,8 @@ def test_what_was_shown_weighs_as_if_nobody_lapsed(model: Boltzmann, generator: 
     samples = belief.prior(2, 3, generator)
     rows = torch.randn(2, 1, 4, 3, generator=generator)
     evidence = evidence_of({"rows": rows, "offsets": torch.zeros(2, 1, 4)})
-    likely = -np.log1p(np.exp(-2.0 * np.einsum("smd,sgjd->smj", samples, rows)).sum(-1))
+    returns = np.einsum("smd,sgjd->smj", samples.double(), rows.double())
+    likely = -np.log1p(np.exp(-2.0 * returns).sum(-1))
     likelihood = belief._likelihood(samples, evidence[:, -1])
     found = belief._foreseen(samples, evidence, likelihood).numpy()
     assert np.allclose(found, likely, atol=1e-4)
@@ -195,6 +201,30 @@ def test_compiled_moves_count_by_the_same_scales(model: Boltzmann, generator: Ge
     assert ((compiled - expected).norm(dim=-1) < 1e-3).float().mean() > 0.99
     plain = tensor_moves(samples, poles, uniform, target._replace(scales=None))
     assert ((plain - expected).norm(dim=-1) < 1e-3).float().mean() < 0.8
+
+
+@pytest.mark.parametrize(
+    "model",
+    [Boltzmann(3.0), Boltzmann(3.0, lapse=0.2), Boltzmann(2.0, Weak(1.0)), Boltzmann(40.0)],
+    ids=str,
+)
+def test_compiled_lengths_are_those_in_tensors(model: Boltzmann, generator: Generator) -> None:
+    """With answers that were not given among them, some not at all, and a power of the density."""
+    size, n_samples, deviation = 20, 50, 1.1
+    omega = uniform_sphere((size, n_samples, 3), generator)
+    options = torch.randn(size, 7, 2, 3, generator=generator)
+    answers = torch.randint(-1, 2, (size, 7), generator=generator)
+    answers[:, -1] = 1
+    scales = 0.01 + 4 * torch.rand(size, 2, n_samples, generator=generator)
+    slack, power = torch.rand(size, generator=generator) / 10, torch.full((size,), 0.7)
+    target = Target(model.evidence(options, answers), slack, power, model, scales)
+    uniform = torch.rand(size, n_samples, 1 + MAX_SHRINKS, generator=generator)
+    compiled = compiled_lengths(omega, uniform, target, deviation, model.tau)
+    expected = tensor_lengths(omega, uniform, target, deviation)
+    assert ((compiled / expected - 1).abs() < 1e-3).float().mean() > 0.99
+    assert torch.equal(move_lengths(omega, uniform, target, deviation), compiled)
+    moved = (compiled.squeeze(-1) / scales[:, 0]).log().abs()
+    assert float(moved.mean()) > 0.3
 
 
 def test_scores_take_returns_from_samples_and_directions_for_alignment(

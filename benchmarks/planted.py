@@ -139,9 +139,9 @@ FAULTS = (
     ),
     Fault(
         "the prior of tau is too narrow",
-        "beliefs/rationality.py",
-        "prior = -(log_length / deviation).square() / 2",
-        "prior = -(log_length / deviation).square()",
+        "beliefs/lengths_cpu.py",
+        "return 0.5 * (log_length / deviation) ** 2",
+        "return (log_length / deviation) ** 2",
         "beliefs/test_rationality.py",
     ),
     Fault(

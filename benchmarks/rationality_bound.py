@@ -57,7 +57,9 @@ def main() -> None:
                 row[f"{kind} less told rightly"] = difference(every[-1])
             table.append(row)
         row = {"pool": name, "greedy by": how, "factor": "all"}
-        table.append(row | {f"{k} less told rightly": difference(torch.cat(lost[k])) for k in lost})
+        for kind, every in lost.items():  # all factors are of the same humans
+            row[f"{kind} less told rightly"] = difference(torch.stack(every).mean(0))
+        table.append(row)
     title = f"Cosine of the guess after the same answers, {options.humans} humans a row"
     common.report(title, table, options.json)
 

@@ -76,7 +76,7 @@ def _stretch_session(
     place, odds, proposal = here.copy(), scales[1].copy(), here.copy()
     level = _surprise(returns, raised, ends, floors, odds, np.exp(here), still, False, 0.0)
     for m in range(n):
-        level[m] = power * level[m] + 0.5 * (here[m] / deviation) ** 2
+        level[m] = power * level[m] + _far(here[m], deviation)
         level[m] = min(level[m] - math.log1p(-uniform[m, 0]), 1e300)  # the impossible stays above
     left, refused = np.arange(n), np.empty(n, np.int64)
     for i in range(1, uniform.shape[1]):
@@ -88,7 +88,7 @@ def _stretch_session(
         n_tried, n = n, 0
         for j in range(n_tried):
             m = left[j]
-            if power * surprise[j] + 0.5 * (proposal[j] / deviation) ** 2 <= level[m]:
+            if power * surprise[j] + _far(proposal[j], deviation) <= level[m]:
                 place[m] = proposal[j]
             else:
                 ranges[int(proposal[j] > here[m]), m] = proposal[j]
@@ -103,3 +103,9 @@ def _stretch_session(
                 returns[0, g, j] = returns[0, g, refused[j]]
     for m in range(len(place)):
         stretched[m] = math.exp(place[m])
+
+
+@compiled
+def _far(log_length: float, deviation: float) -> float:
+    """Minus the logarithm of the prior's density at a log-length, up to a number."""
+    return 0.5 * (log_length / deviation) ** 2

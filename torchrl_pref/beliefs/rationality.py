@@ -56,7 +56,7 @@ class RationalityBelief(Belief):
         self,
         response_model: ResponseModel,
         spread: float = 3.0,
-        samples: int = 400,
+        samples: int = 300,
         moves: int | None = None,
     ) -> None:
         super().__init__(response_model, samples, moves)

@@ -11,7 +11,12 @@ from functools import lru_cache
 import torch
 from torch import Generator, Tensor
 
-from torchrl_pref.beliefs.resampling_cpu import compiled_poles, compiled_resample, compiled_share
+from torchrl_pref.beliefs.resampling_cpu import (
+    compiled_agreement,
+    compiled_poles,
+    compiled_resample,
+    compiled_share,
+)
 
 GROUPS = 10
 """Samples move in directions drawn from the spread of the other groups: of nine tenths of them."""
@@ -27,6 +32,14 @@ def kish_share(log_weights: Tensor) -> Tensor:
     weights = (log_weights - highest.nan_to_num(neginf=0.0)).exp()
     total, square = weights.sum(-1).square(), weights.square().sum(-1)
     return total / (square * log_weights.shape[-1]).clamp(min=1e-30)
+
+
+def agreement(log_likelihood: Tensor) -> tuple[Tensor, Tensor]:
+    """How far samples (S M) agree with an answer of this log-likelihood: Kish's effective share of
+    them that it leaves (S), and how likely they hold it together (S)."""
+    if log_likelihood.is_cpu:
+        return compiled_agreement(log_likelihood)
+    return kish_share(log_likelihood), log_likelihood.exp().mean(1)
 
 
 def log_ratio(log_next: Tensor, log_now: Tensor) -> Tensor:

@@ -45,6 +45,28 @@ def compiled_share(before: Tensor, after: Tensor) -> Tensor:
     return share
 
 
+def compiled_agreement(log_likelihood: Tensor) -> tuple[Tensor, Tensor]:
+    """``resampling.agreement`` of samples with an answer of log-likelihood (S M): (S) and (S)."""
+    share, mean = log_likelihood.new_empty(2, len(log_likelihood))
+    _agree_sessions(*(t.contiguous().numpy() for t in (log_likelihood, share, mean)))
+    return share, mean
+
+
+@compiled
+def _agree_sessions(log_likelihood: Array, share: Array, mean: Array) -> None:
+    """Fill ``share`` (S) and ``mean`` (S)."""
+    n_samples = log_likelihood.shape[1]
+    for s in range(len(share)):
+        highest = max(log_likelihood[s].max(), -1e30)  # where the answer is impossible to all
+        total = square = 0.0
+        for m in range(n_samples):
+            weight = math.exp(log_likelihood[s, m] - highest)
+            total += weight
+            square += weight * weight
+        share[s] = total * total / max(n_samples * square, 1e-30)
+        mean[s] = total * math.exp(highest) / n_samples
+
+
 @compiled
 def _resample_sessions(
     samples: Array,

@@ -22,6 +22,7 @@ from torch.nn import functional as F
 
 from torchrl_pref.beliefs.base import BeliefBase, Update
 from torchrl_pref.beliefs.resampling import (
+    agreement,
     explained_share,
     furthest,
     kish_share,
@@ -139,7 +140,8 @@ class Belief(BeliefBase):
         """:meth:`update` for as many sessions as are held in memory at once."""
         foreseen = self._likelihood(samples, answers[:, -1])
         limit = math.inf if samples.shape[2] == CIRCLE else SURPRISE
-        anew, few = foreseen.exp().mean(1) < limit, kish_share(foreseen) < MIN_SHARE
+        share, likelihood = agreement(foreseen)
+        anew, few = likelihood < limit, share < MIN_SHARE
         inflation = self.n_samples / ess
         if not (anew | few).any():
             after = self._let_in(samples, inflation, answers, generator, foreseen)

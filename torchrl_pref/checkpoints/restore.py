@@ -71,10 +71,10 @@ def restore_sessions(
     n_queries: int,
     n_answers: int,
 ) -> None:
-    """Put saved sessions (B) into the tensordict that a collector goes on from.
+    """Put saved sessions (B) into a tensordict.
 
     Args:
-        carrier: the collector's, of fresh sessions.
+        carrier: where they go, of fresh sessions.
         sessions: as saved.
         state: the part of the carrier that is the environment's state.
         n_queries: N, of the environment's pool.

@@ -46,7 +46,8 @@ class Policy:
 
     @property
     def strategy(self) -> TensorDictModuleBase:
-        """The whole policy, as a collector, a rollout and the evaluation run it."""
+        """The whole policy, as a collector, a rollout and the evaluation run it. A training calls
+        ``observe`` and the actor's modules, and draws from the distribution of the last."""
         modules = (self.actor,) if self.observe is None else (self.observe, self.actor)
         return Acting(*modules)
 

@@ -11,6 +11,7 @@ from typing import Any, cast
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_pref.checkpoints.restore import restore_sessions
 from torchrl_pref.envs.feed import FeedEnv
@@ -107,10 +108,11 @@ class Sessions:
             self._now = self._seen(self.session, self.hidden)
         records: list[Tree] = []
         cut_off: list[tuple[int, Tensor, Tensor]] = []
-        for t in range(self.steps):
-            record, cut = self._step()
-            records.append(record)
-            cut_off += [] if cut is None else [(t, *cut)]
+        with set_exploration_type(ExplorationType.RANDOM):
+            for t in range(self.steps):
+                record, cut = self._step()
+                records.append(record)
+                cut_off += [] if cut is None else [(t, *cut)]
         steps = {key: torch.stack([one[key] for one in records], 1) for key in records[0]}
         batch = TensorDict(steps, (self.env.batch_size.numel(), self.steps))
         self.policy.value(batch)
@@ -133,8 +135,12 @@ class Sessions:
             self.counts = {key: count.index_fill(0, who, 0) for key, count in self.counts.items()}
 
     def _step(self) -> tuple[Tree, tuple[Tensor, Tensor] | None]:
-        """One step of all sessions: what is kept of it, and of those that it cut off which they
-        are, and what the critic gave to them then."""
+        """One step of all sessions.
+
+        Returns:
+            What is kept of it; and where it cut sessions off, which they are and what the critic
+            gives to the states that they ended in.
+        """
         seen = self._acted(self._now)
         after = self.env.advance(self.hidden, self.session, seen["action"])
         self.session = after.session
@@ -165,11 +171,12 @@ class Sessions:
         self._now = self._seen(self.session, self.hidden)
         return record, cut_off
 
+    @torch.no_grad()
     def _seen(self, session: SessionState, hidden: Tree) -> TensorDictBase:
         """What the networks read of sessions."""
         state = {**self.env.shown(session, hidden), "session": session}
         read = {key: state[key] for key in self.read & state.keys()}
-        seen = TensorDict(read, session["n_asked"].shape[:1])
+        seen = TensorDict(read, session["n_asked"].shape[:1], device=self.env.device)
         return seen if self.policy.observe is None else self.policy.observe(seen)
 
     def _acted(self, seen: TensorDictBase) -> TensorDictBase:

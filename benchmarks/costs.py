@@ -1,7 +1,8 @@
 """What single calls cost: metrics, kinds of question, strategies, beliefs, a live session.
 
 ``python benchmarks/costs.py metrics`` (or another one) prints CPU milliseconds on one thread, on
-the Gridworld's pool of 1,000 questions (2,000 trajectories, D = 4), with 100 samples a belief.
+the Gridworld's pool of 1,000 questions (2,000 trajectories, D = 4), with 100 samples a belief, and
+300 in a live session that infers tau.
 """
 
 from __future__ import annotations

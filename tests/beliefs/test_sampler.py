@@ -12,6 +12,7 @@ from torch import Generator, Tensor
 from torchrl_pref.beliefs.resampling import (
     FRAMES,
     GROUPS,
+    agreement,
     explained_share,
     frames_of,
     group_of,
@@ -123,6 +124,18 @@ def test_resampling_follows_the_weights(draw: object, generator: Generator) -> N
     assert copies.mean(0).sum(0).tolist() == pytest.approx(shares.tolist(), abs=0.02)
     assert float(kish_share(log_weights[0])) == pytest.approx(16 / (4 * 6))
     assert float(kish_share(torch.full((4,), -math.inf))) == 0
+
+
+def test_samples_agree_with_an_answer_as_in_tensors(generator: Generator) -> None:
+    """Some hold it likely, some nearly or quite impossible, and of one session all do."""
+    likelihood = -torch.rand(6, 50, generator=generator) * torch.logspace(-6, 2, 6).unsqueeze(1)
+    likelihood[3, ::2] = -math.inf
+    likelihood[5] = -math.inf
+    share, mean = agreement(likelihood)
+    assert torch.allclose(share, kish_share(likelihood), rtol=1e-5)
+    assert torch.allclose(mean, likelihood.exp().mean(1), rtol=1e-5)
+    assert float(share[5]) == float(mean[5]) == 0
+    assert agreement(likelihood.to("meta"))[0].device.type == "meta"
 
 
 def test_the_luck_of_resampling_favours_no_sample(generator: Generator) -> None:

@@ -250,7 +250,6 @@ class Belief(BeliefBase):
         Returns:
             Samples (S M D), inflation (S), and that the answer was used (S).
         """
-        model = self.response_model
         samples = self.prior(len(samples), samples.shape[2], generator).to(samples)
         inflation, power = torch.ones_like(inflation), torch.zeros_like(inflation)
         share = CIRCLE_SHARE if samples.shape[2] == CIRCLE else RESTART_SHARE
@@ -258,14 +257,13 @@ class Belief(BeliefBase):
         for stage in range(RESTART_STAGES):
             if todo.numel() == 0:
                 break
-            tempered = self._tempered(samples[todo], answers[todo])
-            now = power[todo]
+            tempered, now = self._tempered(samples[todo], answers[todo]), power[todo]
             next_power = self._next_power(tempered, now, share)
             if stage == RESTART_STAGES - 1:
                 next_power = torch.ones_like(now)
             power[todo] = next_power
             log_weights = tempered(now, next_power)
-            target = Target(answers[todo], torch.zeros_like(now), next_power, model)
+            target = Target(answers[todo], torch.zeros_like(now), next_power, self.response_model)
             given = samples[todo], inflation[todo], log_weights, target, generator
             samples[todo], inflation[todo] = self._resample_move(*given)
             todo = todo[next_power < 1]

@@ -15,6 +15,7 @@ from pathlib import Path
 
 sys.path[0] = str(Path(__file__).resolve().parents[1])  # this folder's select.py hides Python's
 
+from argparse import ArgumentParser
 from itertools import product
 
 import torch
@@ -45,6 +46,7 @@ from torchrl_pref.tensors import directions
 
 FACTORS = (1 / 8, 1 / 4, 1 / 2, 1.0, 2.0, 4.0, 8.0)
 LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
+GREEDY_BY = ("alignment_gain", "information_gain")
 BUDGET = 20
 TRAJECTORIES = 20
 """Random ones whose returns are looked at, for each human."""
@@ -52,17 +54,13 @@ TRAJECTORIES = 20
 
 def main() -> None:
     """Print the cosines, their paired differences, and the coverage."""
-    parser = common.arguments(__doc__)
-    parser.add_argument("--humans", type=int, default=300, help="of each factor (default 300)")
-    parser.add_argument("--queries", type=int, default=500, help="of a pool (default 500)")
-    parser.add_argument("--seed", type=int, default=0, help="of the humans (default 0)")
+    parser = arguments(__doc__)
     parser.add_argument("--lapse", type=float, default=0.0, help="that beliefs expect (default 0)")
     parser.add_argument("--plot", type=Path, help="also draw the coverage into this file")
     options = common.start(parser)
-    pools = {"Gridworld": gridworld(options.queries), "isotropic": isotropic(options.queries)}
     cosines: list[common.Row] = []
     covered: list[common.Row] = []
-    for (name, pool), how in product(pools.items(), ("alignment_gain", "information_gain")):
+    for (name, pool), how in product(pools(options.queries).items(), GREEDY_BY):
         inside: dict[str, list[Tensor]] = {}
         foreseen: dict[str, list[Tensor]] = {}
         for factor in FACTORS:
@@ -92,9 +90,18 @@ def main() -> None:
         draw(covered, options.plot)
 
 
-def gridworld(n_queries: int) -> QueryPool:
-    """The Gridworld's, normalised."""
-    return common.normalised_pool(n_queries)
+def arguments(doc: str | None) -> ArgumentParser:
+    """What can be typed: whom to ask, and about what."""
+    parser = common.arguments(doc)
+    parser.add_argument("--humans", type=int, default=300, help="of each factor (default 300)")
+    parser.add_argument("--queries", type=int, default=500, help="of a pool (default 500)")
+    parser.add_argument("--seed", type=int, default=0, help="of the humans (default 0)")
+    return parser
+
+
+def pools(n_queries: int) -> dict[str, QueryPool]:
+    """What is asked about, by name; both normalised."""
+    return {"Gridworld": common.normalised_pool(n_queries), "isotropic": isotropic(n_queries)}
 
 
 def isotropic(n_queries: int) -> QueryPool:

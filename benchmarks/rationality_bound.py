@@ -24,7 +24,7 @@ from torch import Generator, Tensor
 from torch.nn import functional as F
 
 from benchmarks import common
-from benchmarks.rationality import FACTORS, asked, beliefs, difference, gridworld, isotropic
+from benchmarks.rationality import FACTORS, GREEDY_BY, arguments, asked, beliefs, difference, pools
 from torchrl_pref.tensors import directions
 
 WIDTHS = (1e-4, 1e-3, 1e-2, 1e-1, 10.0)
@@ -37,14 +37,9 @@ DRAWS = 1500
 
 def main() -> None:
     """Print the cosines, and what the best guess loses."""
-    parser = common.arguments(__doc__)
-    parser.add_argument("--humans", type=int, default=300, help="of each factor (default 300)")
-    parser.add_argument("--queries", type=int, default=500, help="of a pool (default 500)")
-    parser.add_argument("--seed", type=int, default=0, help="of the humans (default 0)")
-    options = common.start(parser)
-    pools = {"Gridworld": gridworld(options.queries), "isotropic": isotropic(options.queries)}
+    options = common.start(arguments(__doc__))
     table: list[common.Row] = []
-    for (name, pool), how in product(pools.items(), ("alignment_gain", "information_gain")):
+    for (name, pool), how in product(pools(options.queries).items(), GREEDY_BY):
         lost: dict[str, list[Tensor]] = {"best guess": [], "inferred": []}
         for factor in FACTORS:
             belief = beliefs(factor, 0.0)["inferred"]

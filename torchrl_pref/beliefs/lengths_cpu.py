@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_pref.beliefs.slice_cpu import _flatten, _surprise
+from torchrl_pref.beliefs.slice_cpu import _flatten, _products, _surprise
 from torchrl_pref.compiled import compiled
 
 SLICE_DIGEST = "b94f392f70ca"
@@ -62,13 +62,10 @@ def _stretch_session(
 ) -> None:
     """Fill ``stretched`` (M) with new lengths of the samples of a session, whose directions are
     ``omega`` (M D) and whose lengths and floors are ``scales`` (2 M)."""
-    n, n_features = omega.shape
+    n = len(omega)
     # As points of circles that do not turn: gaps are returns[0] · length + raised.
     returns, still = np.zeros((2, len(raised), n)), np.zeros(n)
-    for g in range(len(raised)):
-        for d in range(n_features):
-            for m in range(n):
-                returns[0, g, m] += rows[g, d] * omega[m, d]
+    returns[0] = _products(rows, omega)
     here, ranges = np.empty(n), np.empty((2, n))
     for m in range(n):
         here[m] = min(max(math.log(scales[0, m]), -end), end)

@@ -43,8 +43,8 @@ class RationalityBelief(Belief):
         spread: the factor by which people's tau differs from the model's, either way: two in three
             are within it, and 19 in 20 within its square.
         samples: M, see :class:`Belief`; more than of ω alone, as each is of tau, too. With 100 the
-            cosine of the mean after 20 answers was up to .03 lower where people's tau is half the
-            model's or less, and up to .004 elsewhere (docs/beliefs.md).
+            cosine of the mean after 20 answers was .006 to .009 lower on the Gridworld, on average
+            over how careful people are (docs/beliefs.md).
         moves: of ω after each resampling, see :class:`Belief`; one of tau follows.
 
     Raises:

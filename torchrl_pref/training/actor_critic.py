@@ -28,7 +28,8 @@ class ActorCritic(ABC):
         settings: the constants of the training.
 
     Attributes:
-        optimizer: of all weights that the loss depends on.
+        learned: all weights that the loss depends on.
+        optimizer: of these.
     """
 
     def __init__(self, policy: Policy, loss: LossModule, settings: TrainingSettings) -> None:
